@@ -13,6 +13,7 @@ No weight depends on the picture's size, so the real car's policy goes through t
 and a few more steps at its own size carry it there.
 """
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -43,6 +44,15 @@ JUDGED_AT_ONCE = 64  # frames
 HELD_WEIGHT = 0.1  # of an action that hardly varies: its noise would outweigh what the picture decides
 FALLS = 0.02  # a further round is worth its time while the error falls by this share
 BACKBONE_SHARE = 0.75  # of the budget, for the backbone's rounds: the other phases take about as long as one of them
+
+
+@dataclass(frozen=True)
+class Overrides:
+    """What replaces a recipe's values. steps: of all phases together, of one round each. minutes: the budget."""
+
+    steps: int | None = None
+    batch: int | None = None
+    minutes: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,19 +93,21 @@ class TrainingRecipe(Recipe):
         return Augmentation(self.light, self.shift, self.blur, self.noise)
 
     @classmethod
-    def of(
-        cls, size: str, device: str, steps: int | None = None, batch: int | None = None, minutes: float | None = None
-    ) -> Self:
-        """Return the recipe of params.yml for that size; with cuda's own values, if it has some.
-
-        steps: in all, of one round each. minutes: the budget instead of the recipe's.
-        """
+    def of(cls, size: str, device: str, overrides: Overrides | None = None) -> Self:
+        """Return the recipe of params.yml for that size; with cuda's own values, if it has some."""
         recipes = params()["train"]
         values = recipes[size] | (recipes.get(f"{size}_{device}") or {})
-        recipe = cls.read(f"train: {size}", values | {"at": tuple(values["at"]) if values.get("at") else None})
-        recipe = recipe if steps is None else recipe.of_few(steps)
-        recipe = recipe if minutes is None else replace(recipe, minutes=minutes)
-        return replace(recipe, batch=batch, transformer_batch=batch, together_batch=batch) if batch else recipe
+        if values.get("at"):
+            values |= {"at": tuple(values["at"])}
+        recipe = cls.read(f"train: {size}", values)
+        overrides = overrides or Overrides()
+        if overrides.steps is not None:
+            recipe = recipe.of_few(overrides.steps)
+        if overrides.minutes is not None:
+            recipe = replace(recipe, minutes=overrides.minutes)
+        if batch := overrides.batch:
+            recipe = replace(recipe, batch=batch, transformer_batch=batch, together_batch=batch)
+        return recipe
 
     def of_few(self, steps: int) -> Self:
         """Return the same recipe with `steps` steps in all, and with fewer frames: they only show that it works."""
@@ -131,15 +143,21 @@ class PolicyTraining:
         recipe = self.recipe
         return loop.batch_of(self.data, rows, self.rng, self.weights.device, recipe.augmentation, recipe.mirrored)
 
+    def train(
+        self, phase: Phase, module: nn.Module, count: int, loss: Callable[[Batch], Tensor]
+    ) -> tuple[torch.optim.Optimizer, Any]:
+        """Train a module on batches of `count` frames; return its optimiser and scheduler."""
+        return self.saved.train(phase, module, self.rng, lambda _: self.batch(count), loss)
+
     def loss(self, batch: Batch) -> Tensor:
         """Return the policy's loss; pictures become its input, feature maps are that already."""
-        seen = loop.normalised(batch[IMAGE], batch) if batch[IMAGE].dtype == torch.uint8 else batch[IMAGE]
-        return loop.policy_loss(self.policy, {**batch, IMAGE: seen}, self.weights)
+        images = loop.normalised(batch[IMAGE], batch)
+        return loop.policy_loss(self.policy, {**batch, IMAGE: images}, self.weights)
 
     def judging_blocks(self) -> list[np.ndarray]:
         """Return the rows of what judges, in blocks that fit into memory."""
         count = len(self.judging)
-        return [np.arange(first, min(first + JUDGED_AT_ONCE, count)) for first in range(0, count, JUDGED_AT_ONCE)]
+        return np.split(np.arange(count), range(JUDGED_AT_ONCE, count, JUDGED_AT_ONCE))
 
     def plans(self, maps: loop.RowFile | None = None) -> np.ndarray:
         """Return the policy's plans on what judges it, (n, C, A). maps: as of `plans_on`."""
@@ -163,15 +181,18 @@ def train_in_phases(
     say: Callable[[str], object],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Train, and return everything in the checkpoint except its config, and what was learned of each action."""
-    p, device, workers = params()["calibration"], saved.machine.device, saved.machine.workers
+    p = params()["calibration"]
+    workers = saved.machine.workers
     parts = split(recordings, p["held_out_share"], p["seed"])
     first = replace(size, image_sizes=(recipe.at,)) if recipe.at else size
-    samples, judging = pick_evenly(parts.calibration, recipe.samples), pick_evenly(parts.choosing, recipe.judged)
+    samples = pick_evenly(parts.calibration, recipe.samples)
+    judging = pick_evenly(parts.choosing, recipe.judged)
     data = Frames.of(samples, first.image_sizes[0], workers)
     frames = Frames.of(judging, first.image_sizes[0], workers)
     judges = Judges.of(recordings.layout.action_names, data.chunks, data.is_pad, frames.chunks, frames.is_pad)
     actions = data.chunks[~data.is_pad]
-    mean, spread = actions.mean(axis=0), np.maximum(actions.std(axis=0), 1e-3)
+    mean = actions.mean(axis=0)
+    spread = np.maximum(actions.std(axis=0), 1e-3)
     # Errors count in % of the range, so that a throttle that is held does not outweigh steering by its noise. The
     # largest spread counts 1, as LeRobot's loss has a second part.
     counting = judges.varies if judges.varies.any() else np.ones_like(judges.varies)
@@ -186,17 +207,18 @@ def train_in_phases(
             policy.model.action_head.bias.copy_(torch.from_numpy(mean))
         saved.machine.taking(policy)
         rng = np.random.default_rng([seed, 77])
-        loss_weights = torch.from_numpy(weights.astype(np.float32)).to(device)
+        loss_weights = torch.from_numpy(weights.astype(np.float32)).to(saved.machine.device)
         training = PolicyTraining(first, policy, data, frames, judges, recipe, loss_weights, rng, saved, say)
         backbone = saved.machine.taking(live_backbone(pretrained))
-        head = PlanFromFeatures(backbone, mean, spread, size.chunk).to(device)
+        head = PlanFromFeatures(backbone, mean, spread, size.chunk).to(saved.machine.device)
         _train_backbone(training, head)
         before = _train_transformer(training)
         optimizer, scheduler = _train_together(
             training, "all together", recipe.together_steps, recipe.together_rounds, before
         )
         if recipe.at:
-            data, frames = (Frames.of(each, size.image_sizes[0], workers) for each in (samples, judging))
+            data = Frames.of(samples, size.image_sizes[0], workers)
+            frames = Frames.of(judging, size.image_sizes[0], workers)
             training = replace(training, data=data, judging=frames)
             optimizer, scheduler = _train_together(training, "at full size", recipe.carry_steps)
         plans = training.plans()
@@ -222,19 +244,21 @@ def _hold(
     A throttle that was held in each session has nothing to do with the picture, and would be guessed from its light.
     errors: by action, (A,), in % of the range. usual: (A,), in the action's unit.
     """
-    held = np.flatnonzero(~judges.varies & (errors >= judges.blind_pct))
+    constant = np.flatnonzero(~judges.varies & (errors >= judges.blind_pct))
     head = policy.model.action_head
     with torch.no_grad():
-        for i in held.tolist():
+        for i in constant.tolist():
             head.weight[i] = 0
             head.bias[i] = float(usual[i])
             say(f"{judges.names[i]} hardly varies, and is held at {usual[i]:.3f}")
-    return bool(len(held))
+    return bool(len(constant))
 
 
 def _train_backbone(training: PolicyTraining, model: PlanFromFeatures) -> None:
     """Phase one: train the backbone in rounds, then measure on the data the statistics that stay frozen."""
-    recipe, saved, live = training.recipe, training.saved, model.backbone
+    recipe = training.recipe
+    saved = training.saved
+    live = model.backbone
     at_steps = torch.from_numpy(model.steps).to(training.weights.device)
 
     def loss(batch: Batch) -> Tensor:
@@ -244,25 +268,21 @@ def _train_backbone(training: PolicyTraining, model: PlanFromFeatures) -> None:
     def judge() -> tuple[float, np.ndarray]:
         """Return the mean squared error, as of `loss`, and the errors by action, in % of the range."""
         model.eval()
-        data, plans = training.judging, []
+        data = training.judging
+        plans = []
         with torch.no_grad():
             for rows in training.judging_blocks():
                 pictures = torch.from_numpy(data.pictures(rows)).to(training.weights.device)
                 plans.append(model(loop.normalised(pictures)).cpu().numpy())
         model.train()
-        recorded, known = data.chunks[:, model.steps], ~data.is_pad[:, model.steps]
-        errors = (np.concatenate(plans) - recorded)[known]
+        present = ~data.is_pad[:, model.steps]
+        errors = (np.concatenate(plans) - data.chunks[:, model.steps])[present]
         squared = float(np.square(errors * training.weights.cpu().numpy()).mean())
         return squared, 100 * np.abs(errors).mean(axis=0) / training.judges.ranges
 
-    def learn(phase: str, number: int) -> None:
-        saved.train(
-            Phase(phase, recipe.backbone_steps, recipe.backbone_rate / number**0.5),
-            model,
-            training.rng,
-            batch=lambda _: training.batch(recipe.batch),
-            loss=loss,
-        )
+    def learn(name: str, number: int) -> None:
+        phase = Phase(name, recipe.backbone_steps, recipe.backbone_rate / number**0.5)
+        training.train(phase, model, recipe.batch, loss)
 
     model.train()
     _in_rounds(training, model, "backbone", recipe.backbone_rounds, BACKBONE_SHARE, learn, judge)
@@ -292,8 +312,9 @@ def _in_rounds(
     share: of the budget, that this phase and those before it may take. learn: does a round, by its phase's name and its
     number from 1. judge: the error that counts, and the errors by action. best: the error before the first round.
     """
-    saved, judged = training.saved, list[list[float]]()
-    kept = {k: v.clone() for k, v in module.state_dict().items()}
+    saved = training.saved
+    history = list[list[float]]()
+    best_weights = copy.deepcopy(module.state_dict())
     for number in range(1, rounds + 1):
         phase = name if number == 1 else f"{name}{ROUND}{number}"
         if number > 1 and not saved.may_begin(phase, number - 1, share * 60 * training.recipe.minutes):
@@ -301,15 +322,16 @@ def _in_rounds(
             break
         learn(phase, number)
         error, errors_pct = judge()
-        judged.append([number, *map(float, errors_pct)])
+        history.append([number, *map(float, errors_pct)])
         training.say(f"{phase}: {training.judges.words(errors_pct)}")
-        falls, before = error < best * (1 - FALLS), best
-        if error < before:
-            best, kept = error, {k: v.clone() for k, v in module.state_dict().items()}
+        falls = error < best * (1 - FALLS)
+        if error < best:
+            best = error
+            best_weights = copy.deepcopy(module.state_dict())
         if not falls:
             break
-    module.load_state_dict(kept)
-    saved.judged[name] = judged
+    module.load_state_dict(best_weights)
+    saved.judged[name] = history
 
 
 def _train_transformer(training: PolicyTraining) -> np.ndarray:
@@ -317,32 +339,35 @@ def _train_transformer(training: PolicyTraining) -> np.ndarray:
 
     Returns its errors by action, (A,), in % of the range.
     """
-    policy, recipe, data, rng = training.policy, training.recipe, training.data, training.rng
+    policy = training.policy
+    recipe = training.recipe
+    data = training.data
+    rng = training.rng
     backbone = policy.model.backbone.eval()
-    chosen = np.asarray(pick_evenly(range(len(data)), recipe.feature_samples))
-    varied = np.arange(len(chosen)) % 2 == 1
-    flipped = varied & (rng.random(len(chosen)) < recipe.mirrored)
-    learned = _features(training, "learned", data, chosen, backbone, varied, flipped)
+    sources = np.asarray(pick_evenly(range(len(data)), recipe.feature_samples))  # a row of data for each map
+    varied = np.arange(len(sources)) % 2 == 1
+    flipped = varied & (rng.random(len(sources)) < recipe.mirrored)
+    maps = _features(training, "learned", data, sources, backbone, varied, flipped)
     judging = np.arange(len(training.judging))
-    judged = _features(training, "judges", training.judging, judging, backbone)
+    judging_maps = _features(training, "judges", training.judging, judging, backbone)
 
     def batch(_: int) -> Batch:
-        picked = rng.choice(len(chosen), min(recipe.transformer_batch, len(chosen)), replace=False)
-        rows = chosen[picked]
+        picked = rng.choice(len(sources), min(recipe.transformer_batch, len(sources)), replace=False)
+        rows = sources[picked]
         states = loop.swap_states(data, rows, rng)
         chunks = data.chunks[rows].copy()
         states[flipped[picked], 0] *= -1
         chunks[flipped[picked], :, 0] *= -1
-        arrays = {IMAGE: learned[picked], STATE: states, ACTION: chunks, IS_PAD: data.is_pad[rows]}
+        arrays = {IMAGE: maps[picked], STATE: states, ACTION: chunks, IS_PAD: data.is_pad[rows]}
         return loop.on_device(arrays, training.weights.device)
 
-    policy.model.backbone = loop.Given()
+    policy.model.backbone = loop.FeatureInput()
     policy.train()
     phase = Phase("transformer", recipe.transformer_steps, recipe.transformer_rate, recipe.transformer_warmup)
     with loop.threads(1 if policy.config.dim_model < SMALL_DIM else torch.get_num_threads()):
-        best = Best(lambda: training.judge(judged), training.judges.overall_pct)
+        best = Best(lambda: training.judge(judging_maps), training.judges.overall_pct)
         training.saved.train(phase, policy, rng, batch, training.loss, best)
-        errors = training.judge(judged)
+        errors = training.judge(judging_maps)
     training.say(f"transformer: {training.judges.words(errors)}")
     policy.model.backbone = backbone
     return errors
@@ -352,22 +377,24 @@ def _features(
     training: PolicyTraining,
     name: str,
     data: Frames,
-    chosen: np.ndarray,
+    sources: np.ndarray,
     backbone: nn.Module,
     varied: np.ndarray | None = None,
     flipped: np.ndarray | None = None,
 ) -> loop.RowFile:
-    """Compute the frozen backbone's maps of chosen rows, (n,), into a file. No gradients: two batches fit at once.
+    """Compute the frozen backbone's maps of rows, `sources` (n,), into a file. No gradients: two batches fit at once.
 
     varied: (n,) bool, whose pictures are varied as the backbone's phase does; flipped: which of them are mirrored.
     """
-    recipe, rng = training.recipe, training.rng
-    count, (size,) = 2 * recipe.batch, training.size.image_sizes
+    recipe = training.recipe
+    rng = training.rng
+    count = 2 * recipe.batch
+    (size,) = training.size.image_sizes
     maps = loop.RowFile(training.saved.folder / f"{name}.rows", (FEATURES, *training.size.grid(*size)))
 
     def read(step: int) -> Batch:
         rows = slice(step * count, (step + 1) * count)
-        images = data.pictures(chosen[rows])
+        images = data.pictures(sources[rows])
         if varied is None or flipped is None:
             return loop.on_device({IMAGE: images}, training.weights.device)
         images[flipped[rows]] = images[flipped[rows], :, ::-1]
@@ -375,7 +402,7 @@ def _features(
         variation = recipe.augmentation.draw(len(images), rng, of=varied[rows])
         return loop.on_device({IMAGE: images, **variation}, training.weights.device)
 
-    for _, batch in training.saved.steps(f"features, {name}", -(-len(chosen) // count), rng, read, maps=maps):
+    for _, batch in training.saved.steps(f"features, {name}", -(-len(sources) // count), rng, read, maps=maps):
         variation = {key: value for key, value in batch.items() if key != IMAGE}
         with torch.no_grad():
             maps.append(backbone(loop.normalised(batch[IMAGE], variation))["feature_map"].cpu())
@@ -389,24 +416,22 @@ def _train_together(
 
     before: the errors by action, (A,), until then, if they are known.
     """
-    policy, saved, made = training.policy, training.saved, list[Any]()
+    policy = training.policy
+    last_round: tuple[torch.optim.Optimizer, Any] | None = None
 
     def judge() -> tuple[float, np.ndarray]:
         errors = training.judge()
         return training.judges.overall_pct(errors), errors
 
-    def learn(phase: str, _: int) -> None:
+    def learn(name: str, _: int) -> None:
+        nonlocal last_round
         policy.train()
-        made[:] = saved.train(
-            Phase(phase, steps, training.recipe.transformer_rate / 10),
-            policy,
-            training.rng,
-            batch=lambda _: training.batch(training.recipe.together_batch),
-            loss=training.loss,
-        )
+        phase = Phase(name, steps, training.recipe.transformer_rate / 10)
+        last_round = training.train(phase, policy, training.recipe.together_batch, training.loss)
 
-    before = training.judge() if before is None else before
+    if before is None:
+        before = training.judge()
     _in_rounds(training, policy, name, rounds, 1.0, learn, judge, training.judges.overall_pct(before))
-    saved.judged[name].insert(0, [0, *map(float, before)])
-    optimizer, scheduler = made
-    return optimizer, scheduler
+    training.saved.judged[name].insert(0, [0, *map(float, before)])
+    assert last_round is not None  # there is at least one
+    return last_round

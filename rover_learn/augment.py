@@ -46,12 +46,12 @@ class Augmentation:
         if not self.shift:
             return pictures
         height, width = pictures.shape[1:3]
-        moved = np.empty_like(pictures)
+        output = np.empty_like(pictures)
         for i, picture in enumerate(pictures):
             right, down = rng.uniform(-self.shift, self.shift, 2) * (width, height)
             matrix = np.array([[1, 0, round(right)], [0, 1, round(down)]], np.float32)
-            moved[i] = cv2.warpAffine(picture, matrix, (width, height), borderMode=cv2.BORDER_REPLICATE)
-        return moved
+            output[i] = cv2.warpAffine(picture, matrix, (width, height), borderMode=cv2.BORDER_REPLICATE)
+        return output
 
 
 def vary(pictures: Tensor, variation: Mapping[str, Tensor]) -> Tensor:

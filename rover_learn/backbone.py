@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torchvision
 from torch import Tensor, nn
 
 from rover_lib.onboard.errors import TrainingError
@@ -44,8 +45,6 @@ class Pretrained:
         """
         if str(source) != IMAGENET:
             return cls._read(Path(source))
-        import torchvision
-
         weights = torchvision.models.ResNet18_Weights.IMAGENET1K_V1
         before_s = socket.getdefaulttimeout()
         socket.setdefaulttimeout(CONNECTS_S)
@@ -63,39 +62,29 @@ class Pretrained:
         try:
             content = torch.load(file, map_location="cpu", weights_only=True)
         except Exception as error:  # whatever another file makes torch say
-            what = f"{file}: not a file of weights that torch can read"
-            raise TrainingError(what, found=type(error).__name__, remedy="save resnet18's state_dict()") from error
+            problem = f"{file}: not a file of weights that torch can read"
+            raise TrainingError(problem, found=type(error).__name__, remedy="save resnet18's state_dict()") from error
         return cls(_of_backbone(content, str(file)), {"backbone": file.name, "backbone_sha256": sha256_of(file)})
 
 
 def _of_backbone(content: Any, where: str) -> dict[str, Tensor]:
     """Return the weights below the classifier. Raises TrainingError if they are not ResNet18's."""
-    expected = {name: value.shape for name, value in _resnet().state_dict().items() if not name.startswith("fc.")}
+    expected = live_backbone(None).state_dict()
     entries = content if isinstance(content, dict) else {}
-    for name, shape in expected.items():
+    for name, own in expected.items():
         value = entries.get(name)
-        if not isinstance(value, Tensor) or value.shape != shape:
-            found = list(value.shape) if isinstance(value, Tensor) else sorted(map(str, entries))[:3] or None
-            remedy = "save the state_dict() of torchvision's resnet18"
-            raise TrainingError(
-                f"{where}: not ResNet18's weights: {name} is missing or differs", found=found, remedy=remedy
-            )
+        if not isinstance(value, Tensor) or value.shape != own.shape:
+            actual = list(value.shape) if isinstance(value, Tensor) else sorted(map(str, entries))[:3] or None
+            problem = f"{where}: not ResNet18's weights: {name} is missing or differs"
+            raise TrainingError(problem, found=actual, remedy="save the state_dict() of torchvision's resnet18")
         if not torch.isfinite(value).all():
             raise TrainingError(f"{where}: {name} has values that are not finite", remedy="take another file")
     return {name: entries[name] for name in expected}
 
 
-def _resnet() -> nn.Module:
-    import torchvision
-
-    return torchvision.models.resnet18(weights=None)
-
-
 def live_backbone(pretrained: Pretrained | None) -> nn.Module:
     """Return ResNet18 up to its last stage, with live batch norm: (B, 3, H, W) -> {"feature_map": (B, 512, h, w)}."""
-    import torchvision
-
-    resnet = _resnet()
+    resnet = torchvision.models.resnet18(weights=None)
     if pretrained:
         resnet.load_state_dict(pretrained.weights, strict=False)
     return torchvision.models._utils.IntermediateLayerGetter(resnet, {"layer4": "feature_map"})

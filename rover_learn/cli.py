@@ -158,12 +158,14 @@ def train(episodes: "Source", output: Path, backbone: str, **options: Any) -> No
     resume; for that it keeps up to 5 GB in the cache, $ROVER_CACHE or ~/.cache/rover.
     """
     from rover_learn import train
+    from rover_learn.act_phases import Overrides
     from rover_learn.curves import read_actions
     from rover_learn.judges import not_learned
     from rover_learn.train import curves_of
     from rover_lib.workshop.installed import typed
 
     options |= {"backbone": None if backbone == "none" else backbone}
+    options["overrides"] = Overrides(*(options.pop(name) for name in ("steps", "batch", "minutes")))
     click.echo(f"trained: {train.train(episodes, output, progress=terminal_bar(), say=click.echo, **options)}")
     actions = read_actions(curves_of(output))
     if lacking := not_learned(actions):

@@ -1,4 +1,4 @@
-"""How a training went: its losses and held-out errors as JSON, as a figure, and as TensorBoard's files."""
+"""How a training went: its losses and held-out errors as JSON, and as a figure."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ def leave_curves(
     errors: Mapping[str, Sequence[Sequence[float]]],
     actions: Mapping[str, Mapping[str, Any]],
 ) -> None:
-    """Write curves.json and curves.png into a new folder, and TensorBoard's files if that is installed.
+    """Write curves.json and curves.png into a new folder.
 
     losses: of each step, by phase; the rounds of a phase are one after the other. errors: [step or round, *held-out
     errors by action], by phase, in % of the range. actions: what was learned of each, as of `Judges.summary`.
@@ -39,18 +39,6 @@ def leave_curves(
         ax.legend()
     rows[1][0].set_ylabel("held-out error, % of the range")
     figure.savefig(folder / "curves.png")
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        return
-    with SummaryWriter(str(folder)) as writer:
-        for phase, values in losses.items():
-            for step, value in enumerate(values):
-                writer.add_scalar(f"loss/{phase}", value, step)
-        for phase, rows_of_phase in errors.items():
-            for at, *by_action in rows_of_phase:
-                for name, error in zip(actions, by_action, strict=True):
-                    writer.add_scalar(f"held-out error, %/{phase}/{name}", error, int(at))
 
 
 def _join_rounds(losses: Mapping[str, Sequence[float]]) -> dict[str, list[float]]:
@@ -62,5 +50,5 @@ def _join_rounds(losses: Mapping[str, Sequence[float]]) -> dict[str, list[float]
 
 
 def read_actions(folder: Path) -> dict[str, dict[str, Any]]:
-    """Return what a training says of each action; {} for one of an older program."""
-    return json.loads((folder / FILE).read_text()).get("actions", {})
+    """Return what a training says of each action."""
+    return json.loads((folder / FILE).read_text())["actions"]

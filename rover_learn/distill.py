@@ -27,7 +27,7 @@ from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop.judge.recorded_range import Range, format_pct, not_judged, pct_of_range
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.samples import Sample, pick_evenly
+from rover_lib.workshop.recordings.samples import Sample, pick_evenly, stack_chunks
 from rover_lib.workshop.recordings.source import Source
 from rover_lib.workshop.run.session import Opened, load
 
@@ -177,8 +177,8 @@ class Distillation(Work):
             teacher_plans.append(plans_of(policy, held_out, self.progress))
             students.append(row | errors_of(teacher_plans[-1], teacher_plans[0], held_out, self.action_range))
         choosing_plans = plans_of(policy, choosing, self.progress)
-        present = ~np.stack([s.is_pad for s in choosing])
-        loss = float(np.abs(choosing_plans - np.stack([s.chunk for s in choosing]))[present].mean())
+        chunks, is_pad = stack_chunks(choosing)
+        loss = float(np.abs(choosing_plans - chunks)[~is_pad].mean())
         hashes = self.write_policy(new, name, learned, loss, recordings.root.name)
         metrics: dict[str, Any] = {"students": students, "losses": learned.losses, "files_sha256": hashes}
         metrics |= {"judged_frames": len(held_out), "held_out_episodes": parts.episodes["held_out"]}
@@ -192,8 +192,8 @@ def errors_of(
 ) -> dict[str, float | None]:
     """teacher_<action>_pct over whole plans and recorded_<action>_pct over the recorded steps. plans: (n, C, A)."""
     to_teacher = np.abs(plans.astype(np.float64) - taught).mean((0, 1))
-    present = ~np.stack([s.is_pad for s in samples])
-    to_recorded = np.abs(plans.astype(np.float64) - np.stack([s.chunk for s in samples]))[present].mean(0)
+    chunks, is_pad = stack_chunks(samples)
+    to_recorded = np.abs(plans.astype(np.float64) - chunks)[~is_pad].mean(0)
     errors = {}
     for i, (action, recorded) in enumerate(action_range.items()):
         errors[f"teacher_{action}_pct"] = pct_of_range(to_teacher[i], recorded)

@@ -49,6 +49,7 @@ from rover_lib.workshop.recordings.samples import (
     frame_rate_hz,
     is_another_rate,
     pick_evenly,
+    stack_chunks,
 )
 from rover_lib.workshop.recordings.source import Source
 
@@ -148,9 +149,8 @@ def _open(
     if len(set(places)) < len(places):
         raise TrainingError("the same recordings are given twice", found=", ".join(places), remedy="leave one out")
     sync_s = params()["calibration"]["sync_s"]
-    read = tuple(
-        with_faults(load_recordings(source, parent.config.chunk, sync_s, progress), progress) for source in sources
-    )
+    loaded = (load_recordings(source, parent.config.chunk, sync_s, progress) for source in sources)
+    read = tuple(with_faults(recordings, progress) for recordings in loaded)
     policies = [parent.recorded_as(recordings.layout, recordings.samples) for recordings in read]
     if any(policy.config != policies[0].config for policy in policies):
         raise TrainingError("the recordings name, order or time states and actions differently", found=places)
@@ -162,7 +162,9 @@ def _open(
 def _part_episodes(read: tuple[Recordings, ...], recipe: FinetuneRecipe) -> _Material:
     """Split the old and the new episodes into those to learn from and those that judge."""
     old = [e for e in read[0].episodes if not e.by_policy]
-    new = [(r, e) for r in read for e in r.episodes if r is not read[0] or e.by_policy]
+    new = [(read[0], e) for e in read[0].episodes if e.by_policy]
+    for recordings in read[1:]:
+        new += [(recordings, e) for e in recordings.episodes]
     corrected = [(r, e) for r, e in new if any(s.driver == HUMAN for s in e.samples)]
     if not corrected:
         remedy = "give the new recordings after the old ones, with drives in which a human took over"
@@ -176,14 +178,19 @@ def _part_episodes(read: tuple[Recordings, ...], recipe: FinetuneRecipe) -> _Mat
         judging = (*parts.choosing, *parts.held_out)
         for name in dict.fromkeys(map(block_of, judging)):
             held_out.append((name, OLD, _driven_by_humans([s for s in judging if block_of(s) == name], old)))
-    count = max(round(len(corrected) * recipe.held_out_share), 1) if recipe.held_out_share and len(corrected) > 1 else 0
+    count = 0
+    if recipe.held_out_share and len(corrected) > 1:
+        count = max(round(len(corrected) * recipe.held_out_share), 1)
     judges = set(np.random.default_rng(recipe.seed).permutation(len(corrected))[:count].tolist())
-    held_out += [(f"{r.root.name}/{e.id}", NEW, human_samples(e)) for r, e in (corrected[i] for i in judges)]
+    for i in judges:
+        recordings, episode = corrected[i]
+        held_out.append((f"{recordings.root.name}/{episode.id}", NEW, human_samples(episode)))
     for recordings in read:
-        own = [e for i, (r, e) in enumerate(corrected) if r is recordings and i not in judges]
-        for kind, by_policy in ((ADDITIONS, False), (CORRECTIONS, True)):
-            of_kind = [human_samples(e) for e in own if e.by_policy == by_policy]
-            taught.append((kind, tuple(chain.from_iterable(of_kind))))
+        by_kind: dict[str, list[Sample]] = {ADDITIONS: [], CORRECTIONS: []}
+        for i, (source, episode) in enumerate(corrected):
+            if source is recordings and i not in judges:
+                by_kind[CORRECTIONS if episode.by_policy else ADDITIONS] += human_samples(episode)
+        taught += [(kind, tuple(samples)) for kind, samples in by_kind.items()]
     watched = chain.from_iterable(e.samples for e in (*old, *(e for _, e in new)))
     return _Material(
         read,
@@ -242,13 +249,11 @@ class Finetuning(Work):
                 lessons = Lessons.open(folder, samples, parent.config, parent, self.rng(f"states, {kind}"))
                 lessons.ask(saved, parent, self.rng(kind))
             all_lessons.append((kind, lessons))
-        whole = {
-            "lessons": [[kind, own.frames.path.parent.name] for kind, own in all_lessons],
-            "recipe": asdict(recipe),
-        }
+        names = [[kind, own.frames.path.parent.name] for kind, own in all_lessons]
+        folder = cache_for("finetune", {"lessons": names, "recipe": asdict(recipe)})
         weights = np.concatenate([_weights(recipe, kind, own, 1 / self.ranges) for kind, own in all_lessons])
         pool = Pool([(own, kind != DEMONSTRATIONS) for kind, own in all_lessons], weights)
-        with Resumable(cache_for("finetune", whole), self.machine, self.progress) as saved:
+        with Resumable(folder, self.machine, self.progress) as saved:
             policy = self.machine.taking(BatchedPolicy(parent.config, parent.weights))
             policy.thaw()
             self.train_policy(saved, policy, pool, self.loss, seen="maps", slower=SLOWER)
@@ -273,11 +278,10 @@ class Finetuning(Work):
         candidates = {when: self.machine.taking(BatchedPolicy(self.config, state)) for when, state in policies.items()}
         for name, kind, samples_of in self.progress(held_out, desc="judging", total=len(held_out)):
             samples = pick_evenly(samples_of, self.recipe.judged_frames)
-            present = ~np.stack([s.is_pad for s in samples])
-            actions = np.stack([s.chunk for s in samples])
+            chunks, is_pad = stack_chunks(samples)
             row: dict[str, Any] = {"episode": name, "kind": kind, "frames": len(samples)}
             for when, policy in candidates.items():
-                off = np.abs(plans_of(policy, samples).astype(np.float64) - actions)[present].mean(0)
+                off = np.abs(plans_of(policy, samples).astype(np.float64) - chunks)[~is_pad].mean(0)
                 for error, (action, ends) in zip(off, self.action_range.items(), strict=True):
                     row[f"{when}_{action}_pct"] = pct_of_range(error, ends)
             rows.append(row)
@@ -323,9 +327,11 @@ def change_points(row: Mapping[str, Any]) -> float:
     row: before_<action>_pct and after_<action>_pct, mean absolute errors in percent of the action's recorded range;
     None for an action that never changes.
     """
-    actions = [key.removeprefix("before_") for key in row if key.startswith("before_")]
-    pairs = [(row[f"before_{action}"], row[f"after_{action}"]) for action in actions]
-    changes = [after - before for before, after in pairs if before is not None and after is not None]
+    changes = []
+    for key, before in row.items():
+        after = row.get(key.replace("before_", "after_", 1))
+        if key.startswith("before_") and before is not None and after is not None:
+            changes.append(after - before)
     return float(np.mean(changes)) if changes else 0.0
 
 

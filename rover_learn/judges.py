@@ -37,7 +37,8 @@ class Judges:
         cls, names: Sequence[str], learned: np.ndarray, learned_pad: np.ndarray, chunks: np.ndarray, is_pad: np.ndarray
     ) -> "Judges":
         """learned, learned_pad: what is learned from, (n, C, A) and (n, C); chunks, is_pad: what judges."""
-        actions, acted = learned[~learned_pad], chunks[~is_pad]
+        actions = learned[~learned_pad]
+        acted = chunks[~is_pad]
         ranges = np.maximum(np.ptp(actions, axis=0), SMALLEST_RANGE)
         blind_pct = 100 * least_blind_errors(learned, learned_pad, chunks, is_pad) / ranges
         # By what is learned from: the verdict holds each action that hardly varies there, so what was held here is held.
@@ -55,25 +56,25 @@ class Judges:
 
     def words(self, errors_pct: np.ndarray) -> str:
         """Say how far each action is off, beside the best guess without eyes."""
-        each = zip(self.names, errors_pct, self.blind_pct, strict=True)
-        return ", ".join(
-            f"{name} {error:.1f} % off (a guess without eyes {blind:.1f} %)" for name, error, blind in each
-        )
+        words = []
+        for name, error, blind in zip(self.names, errors_pct, self.blind_pct, strict=True):
+            words.append(f"{name} {error:.1f} % off (a guess without eyes {blind:.1f} %)")
+        return ", ".join(words)
 
     def summary(self, errors_pct: np.ndarray) -> dict[str, dict[str, Any]]:
         """Return by action its error, the best guess's, whether it varies, and whether it was learned."""
         summary = {}
         for name, error, blind, varies in zip(self.names, errors_pct, self.blind_pct, self.varies, strict=True):
-            found = {"error_pct": float(error), "blind_pct": float(blind), "varies": bool(varies)}
-            summary[name] = found | {"learned": bool(error < LEARNED * blind)}
+            errors = {"error_pct": float(error), "blind_pct": float(blind)}
+            summary[name] = errors | {"varies": bool(varies), "learned": bool(error < LEARNED * blind)}
         return summary
 
 
 def not_learned(actions: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return a sentence for each action that varies and was not learned, and what helps. actions: of `summary`."""
     sentences = []
-    for name, found in actions.items():
-        if found["varies"] and not found["learned"]:
-            errors = f"{found['error_pct']:.1f} % off, a guess without eyes {found['blind_pct']:.1f} %"
+    for name, summary in actions.items():
+        if summary["varies"] and not summary["learned"]:
+            errors = f"{summary['error_pct']:.1f} % off, a guess without eyes {summary['blind_pct']:.1f} %"
             sentences.append(f"{name} was not learned: {errors}. {HELPS.get(name, MORE)}")
     return sentences

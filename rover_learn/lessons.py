@@ -22,10 +22,11 @@ from torch import Tensor, nn
 
 from rover_learn import training
 from rover_learn.augment import GAIN
-from rover_learn.training import ACTION, IMAGE, IS_PAD, STATE, Batch, Frames, Given, Resumable, RowFile
+from rover_learn.training import ACTION, IMAGE, IS_PAD, STATE, Batch, FeatureInput, Frames, Resumable, RowFile
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.workshop.act_config import ActConfig, Affine, lerobot_act
+from rover_lib.workshop.act import Normalise
+from rover_lib.workshop.act_config import ActConfig, lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import Sample, car_of
@@ -41,26 +42,17 @@ FADED = (0.1, 1.0)  # the state of a new recording keeps a share of its steering
 class BatchedPolicy(nn.Module):
     """LeRobot's own policy for many observations at once: raw states in, raw actions out, no dropout, latent zero."""
 
-    image_scale: Tensor
-    image_shift: Tensor
-    state_scale: Tensor
-    state_shift: Tensor
-    action_scale: Tensor
-    action_shift: Tensor
-
     def __init__(self, config: ActConfig, weights: dict[str, Tensor]):
         super().__init__()
         self.config = config
         acting = {name: weight for name, weight in weights.items() if not name.startswith("vae_")}
         self.model = lerobot_act(replace(config, vae_layers=0), acting).model
         self.backbone = self.model.backbone
-        self.model.backbone = Given()
+        self.model.backbone = FeatureInput()
         self.eval()
-        norms = {"image": config.image_norm[0], "state": config.state_norm, "action": config.action_unnorm}
-        for name, norm in norms.items():
-            norm = norm or Affine((1.0,), (0.0,))
-            self.register_buffer(f"{name}_scale", torch.tensor(norm.scale), persistent=False)
-            self.register_buffer(f"{name}_shift", torch.tensor(norm.shift), persistent=False)
+        self.image_norm = Normalise(config.image_norm[0], (1, 1, 1, -1))
+        self.state_norm = Normalise(config.state_norm, (1, -1))
+        self.action_unnorm = Normalise(config.action_unnorm, (1, 1, -1))
 
     def thaw(self) -> None:
         """Make the scale and shift of the batch norms trainable, which LeRobot freezes; the statistics stay frozen."""
@@ -80,14 +72,13 @@ class BatchedPolicy(nn.Module):
 
     def features(self, frames: Tensor) -> Tensor:
         """Return the feature maps, (B, D, h, w), of frames, (B, height, width, 3) uint8 RGB."""
-        x = frames.float() / 255 * self.image_scale + self.image_shift
+        x = self.image_norm(frames.float() / 255)
         return self.backbone(x.permute(0, 3, 1, 2))["feature_map"]
 
     def plan(self, features: Tensor, states: Tensor) -> Tensor:
         """Return raw actions, (B, C, A), for feature maps as `features` gives them and states, (B, 2) float32."""
-        states = states * self.state_scale + self.state_shift
-        actions, _ = self.model({"observation.images": [features], "observation.state": states})
-        return actions * self.action_scale + self.action_shift
+        actions, _ = self.model({"observation.images": [features], "observation.state": self.state_norm(states)})
+        return self.action_unnorm(actions)
 
     def forward(self, frames: Tensor, states: Tensor) -> Tensor:
         return self.plan(self.features(frames), states)
@@ -96,7 +87,8 @@ class BatchedPolicy(nn.Module):
 @torch.inference_mode()
 def plans_of(policy: BatchedPolicy, samples: Sequence[Sample], progress: Progress = silent) -> np.ndarray:
     """Return what a policy would drive on the samples, (n, C, A) float32, clipped to their car's limits."""
-    device, (size,) = policy.image_scale.device, policy.config.image_sizes
+    device = next(policy.parameters()).device
+    (size,) = policy.config.image_sizes
     plans = []
     firsts = range(0, len(samples), BLOCK)
     for first in progress(firsts, desc="judging", total=len(firsts)):
@@ -112,13 +104,13 @@ def plans_of(policy: BatchedPolicy, samples: Sequence[Sample], progress: Progres
 class Lessons:
     """n samples, each seen in two views: a file has a row for each sample, or the row 2 * sample + view.
 
-    asked: (2 n, 2) float32, the states with which the teacher plans. frames: for each sample, (height, width, 3) uint8
+    teacher_states: (2 n, 2) float32 with which the teacher plans. frames: for each sample, (height, width, 3) uint8
     RGB at the student's size, not mirrored. maps: for each view, (D, h, w) float16, the teacher's feature map pooled to
     the student's grid. plans: for each view, (C, A) float32, the teacher's. tokens: as maps, the student's own.
     """
 
     data: Frames
-    asked: np.ndarray
+    teacher_states: np.ndarray
     frames: RowFile
     maps: RowFile
     plans: RowFile
@@ -154,7 +146,7 @@ class Lessons:
     @property
     def blocks(self) -> list[np.ndarray]:
         """The numbers of all samples, in blocks of BLOCK, on which a policy plans at once."""
-        return [np.arange(first, min(first + BLOCK, len(self))) for first in range(0, len(self), BLOCK)]
+        return np.split(np.arange(len(self)), range(BLOCK, len(self), BLOCK))
 
     def pictures(self, rows: np.ndarray, views: np.ndarray) -> np.ndarray:
         """Return the pictures of these samples, (B, height, width, 3) uint8, mirrored where views, (B,), says so."""
@@ -171,7 +163,7 @@ class Lessons:
         """
         both = 2 * rows + views
         mirror = np.where((views == MIRRORED)[:, None], MIRROR, 1).astype(np.float32)
-        states = self.asked[both]
+        states = self.teacher_states[both]
         if new:
             states = self.data.states[rows] * mirror
             states[:, 0] *= rng.uniform(*FADED, len(rows))
@@ -188,7 +180,8 @@ class Lessons:
         blocks = self.blocks
         grid = (self.maps.shape[1], self.maps.shape[2])
         parts: dict[str, Any] = {"frames": self.frames, "maps": self.maps, "plans": self.plans}
-        (size,), device = teacher.config.image_sizes, saved.machine.device
+        (size,) = teacher.config.image_sizes
+        device = saved.machine.device
 
         def read(block: int) -> list[np.ndarray]:
             pictures = [self.data.samples[i].frame_bgr() for i in blocks[block]]
@@ -199,7 +192,7 @@ class Lessons:
             rows = blocks[block]
             self.frames.append(own)
             features = policy.features(_in_both_views(teachers, device))
-            states = torch.from_numpy(self.asked[2 * rows[0] : 2 * rows[-1] + 2]).to(device)
+            states = torch.from_numpy(self.teacher_states[2 * rows[0] : 2 * rows[-1] + 2]).to(device)
             self.maps.append(F.adaptive_avg_pool2d(features, grid).half().cpu())
             self.plans.append(policy.plan(features, states).cpu())
 
@@ -228,7 +221,7 @@ class Pool:
         self.lessons = lessons
         counts = [len(lessons_of) for lessons_of, _ in lessons]
         self._places = np.repeat(np.arange(len(lessons)), counts)
-        self._rows = np.concatenate([np.arange(count) for count in counts])
+        self._rows = np.concatenate(list(map(np.arange, counts)))
         self._shares = None if weights is None else weights / weights.sum()
 
     def batch(self, count: int, rng: np.random.Generator, device: torch.device, *shown: str) -> Batch:
@@ -250,9 +243,8 @@ class Pool:
             own = self._places[drawn] == place
             if own.any():
                 parts.append(lessons.show(self._rows[drawn][own], views[own], new, rng, *shown))
-        return training.on_device(
-            arrays | {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, device
-        )
+        arrays |= {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return training.on_device(arrays, device)
 
 
 def lit(batch: Batch) -> Tensor:

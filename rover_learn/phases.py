@@ -101,9 +101,9 @@ class LessonRecipe(Recipe):
     seed: int
 
     @classmethod
-    def of(cls, *, steps: int | None = None, **given: Any) -> Self:
-        """Take the recipe of params.yml, with each given value that is not None instead. Raises TrainingError."""
-        values = params()[cls.SECTION] | {name: value for name, value in given.items() if value is not None}
+    def of(cls, *, steps: int | None = None, **overrides: Any) -> Self:
+        """Take the recipe of params.yml, with each override that is not None instead. Raises TrainingError."""
+        values = params()[cls.SECTION] | {name: value for name, value in overrides.items() if value is not None}
         recipe = cls.read(cls.SECTION, values)
         return recipe if steps is None else recipe.of_steps(steps)
 

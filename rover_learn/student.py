@@ -11,7 +11,6 @@ that all of them gave.
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
 import torch
@@ -21,6 +20,7 @@ from rover_lib.onboard.errors import TrainingError
 from rover_lib.workshop.act import ACT, FeedForward, multiply_accumulates
 from rover_lib.workshop.act_config import BACKBONES, ActConfig, lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
+from rover_lib.workshop.hooks import watched
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
 from rover_lib.workshop.untrusted import quote_all
 
@@ -177,16 +177,11 @@ def grams_of(
     """Return `Gram.mean` of what each layer reads in run(). rows_of: rows, (n, inputs) each, of a layer's input."""
     grams = {name: Gram() for name in layers}
 
-    def watch(gram: Gram) -> Callable[[nn.Module, tuple[Tensor]], None]:
-        def hook(_: nn.Module, args: tuple[Tensor]) -> None:
-            for rows in rows_of(args[0]):
-                gram.add(rows)
+    def watch(name: str, _: nn.Module, inputs: tuple[Tensor]) -> None:
+        for rows in rows_of(inputs[0]):
+            grams[name].add(rows)
 
-        return hook
-
-    with ExitStack() as hooks:
-        for name, layer in layers.items():
-            hooks.enter_context(layer.register_forward_pre_hook(watch(grams[name])))
+    with watched(layers, watch, before=True):
         run()
     return {name: gram.mean() for name, gram in grams.items()}
 

@@ -12,15 +12,10 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rover_exchange.export_dataset import lerobot_train
-from rover_learn import act_phases
-from rover_learn import augment as augment_module
-from rover_learn import backbone as backbone_module
-from rover_learn import judges as judges_module
-from rover_learn import training as loop
-from rover_learn.act_phases import TrainingRecipe, train_in_phases
+from rover_learn import act_phases, augment, backbone, judges, training
+from rover_learn.act_phases import Overrides, TrainingRecipe, train_in_phases
 from rover_learn.backbone import Pretrained
 from rover_learn.curves import leave_curves
 from rover_learn.phases import VERSIONS
@@ -30,8 +25,7 @@ from rover_lib.onboard.errors import EpisodeError, TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.stage import atomic_path
-from rover_lib.workshop import act as act_module
-from rover_lib.workshop import act_config
+from rover_lib.workshop import act, act_config
 from rover_lib.workshop.act import ActConfig
 from rover_lib.workshop.cache import cache_folder, cache_root, key_of
 from rover_lib.workshop.checkpoint.files import save_torch
@@ -40,16 +34,12 @@ from rover_lib.workshop.checkpoint.trainer import trainer_config
 from rover_lib.workshop.pictures.shown import with_faults
 from rover_lib.workshop.pictures.turning import measure_sides
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings import controls
-from rover_lib.workshop.recordings import episodes as episodes_module
-from rover_lib.workshop.recordings import samples as recorded
+from rover_lib.workshop.recordings import controls, samples
+from rover_lib.workshop.recordings import episodes as recorded_episodes
 from rover_lib.workshop.recordings.blocks import usual_rate_hz
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings
 from rover_lib.workshop.recordings.source import Source
-
-if TYPE_CHECKING:
-    pass
 
 PLANNED_HZ = 30.0  # of the user's trainer
 SIZES = {
@@ -61,6 +51,11 @@ SIZES = {
 # A cached checkpoint that takes minutes is made anew after each change of the code that makes it. One that takes an
 # hour or more is made anew only when this number is raised. Raise it when you change what the same recipe results in.
 FULL_VERSION = 4
+# Whose sources decide what a training results in.
+LEARNERS = (
+    *(sys.modules[__name__], act_phases, backbone, augment, judges, training),
+    *(act, act_config, preprocess, recorded_episodes, controls),
+)
 
 
 def train(
@@ -68,9 +63,7 @@ def train(
     out_path: Path | str,
     size: str = "small",
     seed: int = 0,
-    steps: int | None = None,
-    batch: int | None = None,
-    minutes: float | None = None,
+    overrides: Overrides | None = None,
     *,
     backbone: Path | str | None = None,
     machine: Machine | None = None,
@@ -81,9 +74,9 @@ def train(
 
     episodes: our recordings of one car, or a LeRobotDataset of steering, throttle and one camera. Their calibration
     part trains the policy, the choosing part gives best_val_loss, and the held-out part is left for its judgement.
-    size: 'small' (72x128) or 'full' (the user's policy, 360x640). steps: of all phases together, batch: of each phase;
-    minutes: its budget; None: the recipe's. backbone: weights that it begins with, as Pretrained.of takes them; None:
-    random ones. machine: None takes the best that there is. say: is told what it trains on, and how that goes.
+    size: 'small' (72x128) or 'full' (the user's policy, 360x640). overrides: of the size's recipe in params.yml.
+    backbone: weights that it begins with, as Pretrained.of takes them; None: random ones. machine: None takes the best
+    that there is. say: is told what it trains on, and how that goes.
 
     Returns out_path, which appears complete or not at all; beside it are its <name>_curves/, which say of each action
     how far it is off, and the same policy as LeRobot's folder, <name>_pretrained_model/. On one machine the same input
@@ -91,60 +84,63 @@ def train(
     checkpoint that was made before is taken from the cache.
     Raises TrainingError for a size, device, steps or seed that it cannot use, EpisodeError for recordings.
     """
-    out_path = Path(out_path)
     machine = machine or Machine.of()
-    kind = machine.device.type
+    overrides = overrides or Overrides()
     say(f"training on {machine.words()}")
     if size not in SIZES:
         raise TrainingError(f"a policy's size must be one of {', '.join(SIZES)}", found=repr(size))
     if seed < 0:
         raise TrainingError("training needs a seed from 0", found=seed)
-    recipes = {each: TrainingRecipe.of(size, each, steps, batch, minutes) for each in ("cpu", "cuda")}
-    recipe = recipes[kind]
+    config = SIZES[size]
+    device = machine.device.type
+    recipes = {kind: TrainingRecipe.of(size, kind, overrides) for kind in ("cpu", "cuda")}
+    recipe = recipes[device]
     pretrained = None if backbone is None else Pretrained.of(backbone, say)
-    p = params()["calibration"]
-    recordings = load_recordings(episodes, SIZES[size].chunk, p["sync_s"], progress)
+    recordings = load_recordings(episodes, config.chunk, params()["calibration"]["sync_s"], progress)
     rate_hz = _rate_hz(recordings)
     for caution in with_faults(recordings, progress).cautions():
         say(caution)
-    made_of = {"size": asdict(SIZES[size]), "seed": seed, "split": p}
-    made_of |= {"versions": [version(name) for name in VERSIONS], "version": FULL_VERSION}
-    made_of |= {"episodes": recordings.hashes(), "rate_hz": rate_hz} | ({"amp": True} if machine.amp else {})
-    made_of |= pretrained.origin if pretrained else {}
-    phases = act_phases, backbone_module, augment_module, judges_module, loop, act_module, act_config
-    learners = sys.modules[__name__], *phases, preprocess, episodes_module, controls
-    sources = () if size == "full" and steps is None else learners
-    keys = {each: made_of | {"recipe": asdict(made_by)} for each, made_by in recipes.items()}
-    begun = {each: cache_root() / f"training-{key_of(key, *sources)}" for each, key in keys.items()}
-    unfinished = begun.pop(kind)  # which another device goes on with if its recipe is the same, else:
+    origin = pretrained.origin if pretrained else {}
+    ingredients = {"size": asdict(config), "seed": seed, "split": params()["calibration"], "version": FULL_VERSION}
+    ingredients |= {"versions": [version(name) for name in VERSIONS], "episodes": recordings.hashes()} | origin
+    ingredients |= {"rate_hz": rate_hz} | ({"amp": True} if machine.amp else {})
+    sources = () if size == "full" and overrides.steps is None else LEARNERS
+    keys = {kind: ingredients | {"recipe": asdict(recipe)} for kind, recipe in recipes.items()}
+    begun = {kind: cache_root() / f"training-{key_of(key, *sources)}" for kind, key in keys.items()}
+    unfinished = begun.pop(device)  # which another device goes on with if its recipe is the same, else:
     if not unfinished.exists() and any(folder.exists() for folder in begun.values()):
         say(f"begins anew: what {', '.join(begun)} has begun is of another recipe (params.yml)")
 
     def make(folder: Path) -> None:
-        known = {"learning_rate": recipe.transformer_rate, "batch_size": recipe.batch, "device": kind, "seed": seed}
-        known |= {"data_dir": "episodes", "output_dir": "checkpoints", "pretrained_backbone": pretrained is not None}
-        known |= {"rate_hz": int(rate_hz) if rate_hz.is_integer() else rate_hz}
         with machine.computing(), Resumable(unfinished, machine, progress) as saved:
             began_s = time.monotonic()
-            trained, actions = train_in_phases(
-                _turned(recordings, progress), SIZES[size], recipe, seed, saved, pretrained, say
-            )
+            drives = _turned(recordings, progress)
+            content, actions = train_in_phases(drives, config, recipe, seed, saved, pretrained, say)
             say(f"in {time.monotonic() - began_s:.0f} s")
             leave_curves(folder / "curves", saved.losses, saved.judged, actions)
-            weights = {name.removeprefix("model."): v for name, v in trained["model_state_dict"].items()}
-            config, origin = replace(SIZES[size], rate_hz=rate_hz), {"trained_by": asdict(recipe), "device": kind}
-            origin |= pretrained.origin if pretrained else {}
-            write_lerobot(folder / "pretrained_model", config, weights, origin)
+            weights = {name.removeprefix("model."): v for name, v in content["model_state_dict"].items()}
+            trained_by = {"trained_by": asdict(recipe), "device": device} | origin
+            write_lerobot(folder / "pretrained_model", replace(config, rate_hz=rate_hz), weights, trained_by)
+            settings = {"learning_rate": recipe.transformer_rate, "batch_size": recipe.batch, "device": device}
+            settings |= {"seed": seed, "data_dir": "episodes", "output_dir": "checkpoints"}
+            settings |= {"pretrained_backbone": pretrained is not None}
+            settings |= {"rate_hz": int(rate_hz) if rate_hz.is_integer() else rate_hz}
+            content["config"] = trainer_config(config, **settings)
             # It must be on the disk before the unfinished training, which it comes from, is removed.
-            save_torch(folder / "best_model.pth", {**trained, "config": trainer_config(SIZES[size], **known)})
+            save_torch(folder / "best_model.pth", content)
 
-    made = cache_folder("checkpoint", key_of({**keys[kind], "device": kind}, *sources), make)
+    checkpoint = cache_folder("checkpoint", key_of({**keys[device], "device": device}, *sources), make)
     shutil.rmtree(unfinished, ignore_errors=True)
-    for folder in (each for each in made.iterdir() if each.is_dir()):  # those of older programs have none
-        with build_folder(out_path.with_name(f"{out_path.stem}_{folder.name}")) as new:
-            shutil.copytree(folder, new, dirs_exist_ok=True)
+    return _copy_out(checkpoint, Path(out_path))
+
+
+def _copy_out(checkpoint: Path, out_path: Path) -> Path:
+    """Copy a checkpoint's file from its folder in the cache to `out_path`, and the folders in it beside that."""
+    for name in ("curves", "pretrained_model"):
+        with build_folder(out_path.with_name(f"{out_path.stem}_{name}")) as new:
+            shutil.copytree(checkpoint / name, new, dirs_exist_ok=True)
     with atomic_path(out_path) as temporary:
-        shutil.copyfile(made / "best_model.pth", temporary)
+        shutil.copyfile(checkpoint / "best_model.pth", temporary)
     return out_path
 
 
@@ -159,20 +155,22 @@ def _rate_hz(recordings: Recordings) -> float:
     Raises EpisodeError for recordings that this training is not for.
     """
     layout = recordings.layout
-    recorded.car_of(recordings.samples)
+    samples.car_of(recordings.samples)
     if layout.action_names != ACTION_NAMES or layout.state_names != ACTION_NAMES or len(layout.cameras) != 1:
-        what = f"{recordings.root}: rover train is for cars of steering and throttle with one camera"
+        problem = f"{recordings.root}: rover train is for cars of steering and throttle with one camera"
         remedy = f"name them, as in --action-names steering,throttle, or: {lerobot_train(recordings.root)}"
-        raise EpisodeError(what, found=layout.words(), remedy=remedy)
-    found_hz = layout.rate_hz or usual_rate_hz(recordings.episodes) or PLANNED_HZ
-    as_recorded = layout.rate_hz or recorded.is_another_rate(found_hz, PLANNED_HZ)
-    return float(recorded.round_rate_hz(found_hz)) if as_recorded else PLANNED_HZ
+        raise EpisodeError(problem, found=layout.words(), remedy=remedy)
+    rate_hz = layout.rate_hz or usual_rate_hz(recordings.episodes) or PLANNED_HZ
+    if layout.rate_hz or samples.is_another_rate(rate_hz, PLANNED_HZ):
+        return float(samples.round_rate_hz(rate_hz))
+    return PLANNED_HZ
 
 
 def _turned(recordings: Recordings, progress: Progress) -> Recordings:
     """Return the recordings with the pictures of those that are mirrored beside most others turned over."""
-    mirrored, episodes = measure_sides(recordings, progress).mirrored, []
-    for e in recordings.episodes:
-        samples = tuple(replace(s, mirrored=True) for s in e.samples) if e.id in mirrored else e.samples
-        episodes.append(replace(e, samples=samples))
+    mirrored = measure_sides(recordings, progress).mirrored
+    episodes = list(recordings.episodes)
+    for i, episode in enumerate(episodes):
+        if episode.id in mirrored:
+            episodes[i] = replace(episode, samples=tuple(replace(s, mirrored=True) for s in episode.samples))
     return replace(recordings, episodes=tuple(episodes))

@@ -33,7 +33,7 @@ from rover_lib.onboard.stage import private_lock
 from rover_lib.workshop.checkpoint.files import save_torch
 from rover_lib.workshop.checkpoint.trainer import BETAS, GRAD_CLIP, KL_WEIGHT, WEIGHT_DECAY
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.episodes import Sample
+from rover_lib.workshop.recordings.samples import Sample, stack_chunks
 from rover_lib.workshop.run.session import training_device
 
 if TYPE_CHECKING:
@@ -68,9 +68,10 @@ class Machine:
     @classmethod
     def of(cls, device: str | None = None, workers: int | None = None, amp: bool = False) -> "Machine":
         """Choose a device, and workers for it: a thread for each core if it is a GPU. Raises TrainingError."""
-        where = training_device(device, TrainingError)
-        cores = (os.cpu_count() or 1) if where.type == "cuda" else 0
-        return cls(where, cores if workers is None else workers, amp)
+        torch_device = training_device(device, TrainingError)
+        if workers is None:
+            workers = (os.cpu_count() or 1) if torch_device.type == "cuda" else 0
+        return cls(torch_device, workers, amp)
 
     def seconds(self) -> float:
         """Return the time that a budget counts: of the processor, or, if a GPU computes, as it passes."""
@@ -99,8 +100,10 @@ class Machine:
     def computing(self) -> Iterator[None]:
         """Compute as repeatably as a GPU can, and keep memory. Raises TrainingError if a GPU is full or lost."""
         repeatable = torch.are_deterministic_algorithms_enabled()
-        for option, value in KEPT_MEMORY.items() if hasattr(libc := ctypes.CDLL(None), "mallopt") else ():
-            libc.mallopt(option, value)
+        libc = ctypes.CDLL(None)
+        if hasattr(libc, "mallopt"):
+            for option, value in KEPT_MEMORY.items():
+                libc.mallopt(option, value)
         if self.device.type == "cuda":
             os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS reads it when it starts
             torch.use_deterministic_algorithms(True, warn_only=True)
@@ -108,12 +111,13 @@ class Machine:
         try:
             yield
         except RuntimeError as error:
-            full, found = isinstance(error, torch.OutOfMemoryError), str(error).partition("\n")[0]
-            if not full and "CUDA error" not in found and "cuDNN error" not in found:
+            is_full = isinstance(error, torch.OutOfMemoryError)
+            message = str(error).partition("\n")[0]
+            if not is_full and "CUDA error" not in message and "cuDNN error" not in message:
                 raise
-            what = "its memory is full" if full else "lost"
+            problem = f"{self.device}: {'its memory is full' if is_full else 'lost'}"
             remedy = "run again to resume: nvidia-smi shows what else uses it; or begin anew with a smaller --batch"
-            raise TrainingError(f"{self.device}: {what}", found=found, remedy=remedy) from error
+            raise TrainingError(problem, found=message, remedy=remedy) from error
         finally:
             torch.use_deterministic_algorithms(repeatable)
 
@@ -123,7 +127,7 @@ class Frames:
     """Samples as arrays with a row for each, and their pictures at one size.
 
     size: (height, width). states: (n, 2) float32. chunks: (n, chunk, 2) float32. is_pad: (n, chunk) bool. pool:
-    reads pictures, if there is one. kept: by row, those that were read, unless all of them need too much memory.
+    reads pictures, if there is one. cache: by row, those that were read, unless all of them need too much memory.
     """
 
     samples: tuple[Sample, ...]
@@ -132,17 +136,17 @@ class Frames:
     chunks: np.ndarray
     is_pad: np.ndarray
     pool: ThreadPoolExecutor | None
-    kept: dict[int, np.ndarray] | None
+    cache: dict[int, np.ndarray] | None
 
     @classmethod
     def of(cls, samples: tuple[Sample, ...], size: tuple[int, int], workers: int = 0) -> "Frames":
         """Return the samples; no picture is read yet."""
-        states, chunks = (np.stack([getattr(s, name) for s in samples]) for name in ("state", "chunk"))
-        is_pad = np.stack([s.is_pad for s in samples])
+        states = np.stack([s.state for s in samples]).astype(np.float32)
+        chunks, is_pad = stack_chunks(samples)
         memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        kept: dict[int, np.ndarray] | None = {} if 3 * len(samples) * math.prod(size) <= memory * MEMORY_SHARE else None
+        fits = 3 * len(samples) * math.prod(size) <= memory * MEMORY_SHARE
         pool = ThreadPoolExecutor(workers) if workers else None  # decoders and OpenCV release the interpreter's lock
-        return cls(samples, size, states.astype(np.float32), chunks.astype(np.float32), is_pad, pool, kept)
+        return cls(samples, size, states, chunks.astype(np.float32), is_pad, pool, {} if fits else None)
 
     def __len__(self) -> int:
         return len(self.samples)
@@ -153,11 +157,11 @@ class Frames:
         return np.stack(list(read(self._picture, rows.tolist())))
 
     def _picture(self, row: int) -> np.ndarray:
-        if self.kept is not None and row in self.kept:
-            return self.kept[row]
+        if self.cache is not None and row in self.cache:
+            return self.cache[row]
         picture = prepare_frame(self.samples[row].frame_bgr(), *self.size)
-        if self.kept is not None:
-            self.kept[row] = picture
+        if self.cache is not None:
+            self.cache[row] = picture
         return picture
 
 
@@ -168,7 +172,9 @@ class RowFile:
     """
 
     def __init__(self, path: Path, shape: tuple[int, ...], dtype: type = np.float32):
-        self.path, self.shape, self.dtype = path, shape, np.dtype(dtype)
+        self.path = path
+        self.shape = shape
+        self.dtype = np.dtype(dtype)
         self.row_bytes = math.prod(shape) * self.dtype.itemsize
         self._rows = 0  # although a process that was killed may have left rows in the file
         path.touch()
@@ -186,11 +192,11 @@ class RowFile:
 
     def __getitem__(self, rows: np.ndarray) -> np.ndarray:
         """Return these rows, (n, *shape). They are read, because mapped pages would count as this process's memory."""
-        chosen = np.empty((len(rows), *self.shape), self.dtype)
+        array = np.empty((len(rows), *self.shape), self.dtype)
         for i, row in enumerate(rows):
             data = os.pread(self._file.fileno(), self.row_bytes, int(row) * self.row_bytes)
-            chosen[i] = np.frombuffer(data, self.dtype).reshape(self.shape)
-        return chosen
+            array[i] = np.frombuffer(data, self.dtype).reshape(self.shape)
+        return array
 
     def state_dict(self) -> dict[str, Any]:
         os.fsync(self._file.fileno())
@@ -228,12 +234,13 @@ class Best:
 
     def see(self, module: nn.Module, step: int) -> None:
         """Judge the module, and keep its weights if they are better than all before."""
-        errors = [float(each) for each in self.judge()]
+        errors = [float(error) for error in self.judge()]
         error = self.overall(errors)
         self.seen.append([step, *errors])
         self.stale += 1
         if error < self.error:
-            self.error, self.stale = error, 0
+            self.error = error
+            self.stale = 0
             self.weights = {k: v.detach().clone() for k, v in module.state_dict().items()}
 
     def state_dict(self) -> dict[str, Any]:
@@ -268,8 +275,8 @@ class Resumable:
             self._lock.acquire()
         except Timeout:
             raise TrainingError("another process trains the same", found=self.folder, remedy="wait for it") from None
-        for left in self.folder.glob(".*.pt"):  # of a process that was killed while it saved
-            left.unlink()
+        for unfinished in self.folder.glob(".*.pt"):  # of a process that was killed while it saved
+            unfinished.unlink()
         self._began_s = self.machine.seconds()
         return self
 
@@ -304,15 +311,17 @@ class Resumable:
         """
         file = self.folder / f"{phase}.pt"
         done = self._restore(file, phase, rng, parts) if file.exists() else 0
-        saved_s, took_s = self.clock(), 0.0
+        saved_s = self.clock()
+        took_s = 0.0
 
         def draw(step: int) -> tuple[int, T, Any]:
             return step, batch(step), rng.bit_generator.state
 
         drawn = ahead(draw, range(done, count), AHEAD if self.machine.workers else 0)
-        for step, given, state in self.progress(drawn, desc=f"training, {phase}", total=count, initial=done):
-            yield step, given
-            now_s, last = self.clock(), step + 1 == count or enough()
+        for step, drawn_batch, state in self.progress(drawn, desc=f"training, {phase}", total=count, initial=done):
+            yield step, drawn_batch
+            now_s = self.clock()
+            last = step + 1 == count or enough()
             if last or now_s - saved_s >= max(self.every_s, took_s / SAVING_SHARE):
                 self._save(file, phase, count if last else step + 1, state, parts)
                 saved_s = self.clock()
@@ -338,12 +347,16 @@ class Resumable:
         """
         optimizer, scheduler = optimiser(phase, list(module.parameters()))
         parts: dict[str, Any] = {"module": module, "optimizer": optimizer, "scheduler": scheduler}
-        parts |= {"best": best} if best else {}
+        if best:
+            parts["best"] = best
         patience = max(PATIENCE, PATIENT_SHARE * phase.steps / JUDGE_EVERY)
-        by_heart = (lambda: best.stale >= patience) if best else (lambda: False)
-        for step, given in self.steps(phase.name, phase.steps, rng, batch, by_heart, **parts):
+
+        def learns_by_heart() -> bool:
+            return best is not None and best.stale >= patience
+
+        for step, drawn in self.steps(phase.name, phase.steps, rng, batch, learns_by_heart, **parts):
             with torch.autocast(self.machine.device.type, torch.bfloat16, enabled=self.machine.amp):
-                value = loss(given)
+                value = loss(drawn)
             self.losses[phase.name].append(descend(value, module, optimizer, scheduler))
             if best and (step + 1) % JUDGE_EVERY == 0:
                 best.see(module, step + 1)
@@ -364,9 +377,9 @@ class Resumable:
             for name, part in parts.items():
                 part.load_state_dict(content["parts"][name])
         except Exception as error:  # rows that are missing, or whatever a damaged file makes torch say
-            found = error if isinstance(error, TrainingError) else type(error).__name__
+            cause = error if isinstance(error, TrainingError) else type(error).__name__
             remedy = f"remove {file.parent} to train from the beginning"
-            raise TrainingError(f"{file}: cannot resume from it", found=found, remedy=remedy) from error
+            raise TrainingError(f"{file}: cannot resume from it", found=cause, remedy=remedy) from error
         rng.bit_generator.state = content["numpy"]
         torch.set_rng_state(content["torch"])
         if len(content["cuda"]) == torch.cuda.device_count():
@@ -381,14 +394,15 @@ def ahead(make: Callable[[int], T], items: Iterable[int], count: int) -> Generat
     if not count:
         yield from map(make, items)
         return
-    pool, waiting = ThreadPoolExecutor(1), deque[Future[T]]()
+    pool = ThreadPoolExecutor(1)
+    waiting = deque[Future[T]]()
     try:
         for item in items:
             waiting.append(pool.submit(make, item))
             if len(waiting) > count:
                 yield waiting.popleft().result()
-        for made in waiting:
-            yield made.result()
+        for future in waiting:
+            yield future.result()
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -414,7 +428,9 @@ def batch_of(
 ) -> Batch:
     """Return a batch to learn from: half of the states swapped, its pictures' variation, a share of all mirrored."""
     flipped = rng.random(len(rows)) < mirrored
-    images, states, chunks = data.pictures(rows), swap_states(data, rows, rng), data.chunks[rows].copy()
+    images = data.pictures(rows)
+    states = swap_states(data, rows, rng)
+    chunks = data.chunks[rows].copy()
     images[flipped] = images[flipped, :, ::-1]
     states[flipped, 0] *= -1
     chunks[flipped, :, 0] *= -1
@@ -431,12 +447,15 @@ def on_device(arrays: dict[str, np.ndarray], device: torch.device) -> Batch:
 
 
 def normalised(images: Tensor, variation: Mapping[str, Tensor] | None = None) -> Tensor:
-    """Return pictures, (B, height, width, 3) uint8, as LeRobot's forward expects them.
+    """Return pictures, (B, height, width, 3) uint8, as LeRobot's forward expects them; feature maps as they are.
 
     variation: as `vary` takes it; None: pictures are as they were taken.
     """
+    if images.dtype != torch.uint8:
+        return images
     x = vary(images, variation or {})
-    mean, std = (torch.tensor(each, device=x.device)[:, None, None] for each in (IMAGENET_MEAN, IMAGENET_STD))
+    mean = torch.tensor(IMAGENET_MEAN, device=x.device)[:, None, None]
+    std = torch.tensor(IMAGENET_STD, device=x.device)[:, None, None]
     return (x / 255 - mean) / std
 
 
@@ -518,22 +537,22 @@ class UnfoldedConv(nn.Conv2d):
         return places.transpose(1, 2).unflatten(2, (height, -1))
 
 
-class Given(nn.Module):
+class FeatureInput(nn.Module):
     """Takes the backbone's place while the transformer trains: its input is already the feature map."""
 
     def forward(self, features: Tensor) -> Batch:
         return {"feature_map": features}
 
 
-def plans_on(policy: "ACTPolicy", data: Frames, rows: np.ndarray, maps: RowFile | None = None) -> np.ndarray:
+def plans_on(policy: "ACTPolicy", data: Frames, rows: np.ndarray, maps: RowFile | None) -> np.ndarray:
     """Return the policy's plans, (n, C, A), on these rows, as it drives: no latent is sampled.
 
     maps: feature maps to take instead of the pictures.
     """
     policy.eval()
-    seen = data.pictures(rows) if maps is None else maps[rows]
-    batch = on_device({IMAGE: seen, STATE: data.states[rows]}, next(policy.parameters()).device)
-    batch[IMAGE] = normalised(batch[IMAGE]) if maps is None else batch[IMAGE]
+    images = data.pictures(rows) if maps is None else maps[rows]
+    batch = on_device({IMAGE: images, STATE: data.states[rows]}, next(policy.parameters()).device)
+    batch[IMAGE] = normalised(batch[IMAGE])
     return policy.predict_action_chunk(batch).cpu().numpy()
 
 

@@ -29,8 +29,7 @@ Letters: B batch = 1, T tokens, D model width, H heads, S state size, A actions,
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
-from contextlib import ExitStack
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import numpy as np
@@ -40,7 +39,8 @@ from torch import Tensor, nn
 
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act_config import ACTIVATIONS, BACKBONES, ActConfig, Affine
-from rover_lib.workshop.recordings.samples import Sample
+from rover_lib.workshop.hooks import watched
+from rover_lib.workshop.recordings.samples import Sample, by_camera
 
 Projection = nn.Linear | nn.Conv2d
 Pair = tuple[Tensor, Tensor]  # weight and bias
@@ -425,10 +425,8 @@ class ACT(nn.Module):
         self.config = config
         w = Weights(weights)
         columns = for_int8 and fits_columns(config)
-        self.image_input = nn.ModuleList(
-            Columns(norm, *size) if columns else Pixels(norm)
-            for norm, size in zip(config.image_norm, config.image_sizes, strict=True)
-        )
+        cameras = zip(config.image_norm, config.image_sizes, strict=True)
+        self.image_input = nn.ModuleList(Columns(norm, *size) if columns else Pixels(norm) for norm, size in cameras)
         self.state_norm = Normalise(config.state_norm, (1, -1))
         self.action_unnorm = Normalise(config.action_unnorm, (1, 1, -1))
         self.backbone = Backbone(w.at("backbone"), config, columns)
@@ -496,17 +494,15 @@ def block_of(module_name: str) -> str:
 def multiply_accumulates(model: ACT) -> dict[str, int]:
     """Count the multiply-accumulates of one inference by block. Attention's two products count for its block."""
     counts: Counter[str] = Counter()
-    with ExitStack() as hooks, torch.inference_mode():
-        for name, module in model.named_modules():
 
-            def watch(m: nn.Module, args: tuple, out: Tensor, block: str = block_of(name)) -> None:
-                if isinstance(m, Attention):
-                    residual, _, key, _ = args
-                    counts[block] += 2 * residual.shape[1] * key.numel()  # queries x tokens x width
-                elif isinstance(m, Projection):
-                    counts[block] += out.numel() * m.weight[0].numel()
+    def watch(name: str, module: nn.Module, inputs: tuple, output: Tensor) -> None:
+        if isinstance(module, Attention):
+            residual, _, key, _ = inputs
+            counts[block_of(name)] += 2 * residual.shape[1] * key.numel()  # queries x tokens x width
+        elif isinstance(module, Projection):
+            counts[block_of(name)] += output.numel() * module.weight[0].numel()
 
-            hooks.enter_context(module.register_forward_hook(watch))
+    with watched(dict(model.named_modules()), watch), torch.inference_mode():
         model(*example_inputs(model.config))
     return dict(counts)
 
@@ -519,8 +515,7 @@ def example_inputs(config: ActConfig) -> tuple[Tensor, ...]:
 
 def inputs_of(sample: Sample, config: ActConfig) -> tuple[Tensor, ...]:
     """Return a sample as the graph's inputs: state (1, S) float32, then (height, width, 3) uint8 RGB of each camera."""
-    frame: Any = sample.frame_bgr()
-    frames = frame if isinstance(frame, Mapping) else {config.cameras[0]: frame}
+    frames = by_camera(sample.frame_bgr(), config.cameras[0])
     prepared = (prepare_frame(frames[n], *size) for n, size in zip(config.cameras, config.image_sizes, strict=True))
     state = torch.from_numpy(np.asarray(sample.state, np.float32))[None]
     return state, *map(torch.from_numpy, prepared)

@@ -29,7 +29,10 @@ LEROBOTS = {  # fields of ActConfig by which LeRobot means the same, and its nam
 def backbone_blocks(backbone: str) -> list[str]:
     """Return LeRobot's names of a backbone's residual blocks, in the order in which data passes them."""
     _, depths, _ = BACKBONES[backbone]
-    return [f"backbone.layer{stage}.{block}" for stage, depth in enumerate(depths, 1) for block in range(depth)]
+    names = []
+    for stage, depth in enumerate(depths, 1):
+        names += [f"backbone.layer{stage}.{block}" for block in range(depth)]
+    return names
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,8 @@ class FrameView:
         ranges: Mapping[str, tuple[float, float]],
         rate_hz: float = 30.0,
     ):
-        self.samples, self.policies = samples, policies
+        self.samples = samples
+        self.policies = policies
         self.actions = list(ranges)[: style.MOST_ACTIONS]
         self.figure, axes = style.new_figure(1, 1 + len(self.actions), height_in=2.7)
         self._picture, *self._fields = axes[0]
@@ -65,8 +66,10 @@ class FrameView:
             for who, line in lines.items():
                 line.set_ydata(planned[who][:, i])
         self._picture.clear()
-        said = f"\nunfamiliar (1: stop): {', '.join(scores)}" if scores else ""
-        style.show_picture(self._picture, sample, f"{sample.episode}, {sample.time_s:.1f} s{said}")
+        title = f"{sample.episode}, {sample.time_s:.1f} s"
+        if scores:
+            title += f"\nunfamiliar (1: stop): {', '.join(scores)}"
+        style.show_picture(self._picture, sample, title)
         return self.figure
 
     def png(self, index: int) -> bytes:

@@ -24,11 +24,9 @@ def typed(command: str) -> str:
     """A command as it works in this shell: a program of this environment that is not on PATH gets its folder."""
     program, space, rest = command.partition(" ")
     program_path = Path(sys.executable).with_name(program)
-    return (
-        command
-        if shutil.which(program) or not program_path.is_file()
-        else f"{shlex.quote(relative(program_path))}{space}{rest}"
-    )
+    if shutil.which(program) or not program_path.is_file():
+        return command
+    return f"{shlex.quote(relative(program_path))}{space}{rest}"
 
 
 def relative(path: Path | str) -> str:

@@ -24,7 +24,7 @@ def terminal_bar() -> Progress:
     """A bar if the output is a terminal; one that moves now and then if it goes to a log."""
     from tqdm import tqdm
 
-    return partial(tqdm, leave=False) if sys.stderr.isatty() else partial(tqdm, leave=False, **RARELY)
+    return partial(tqdm, leave=False, **({} if sys.stderr.isatty() else RARELY))
 
 
 def in_jupyterlab() -> bool:
@@ -44,19 +44,18 @@ def _shown_bar(items: Iterable, desc: str = "", total: int | None = None) -> Ite
     """
     from IPython.display import HTML, display
 
-    every = total
-    if every is None and isinstance(items, Sized):
-        every = len(items)
-    most = "" if every is None else f' max="{every}"'
+    if total is None and isinstance(items, Sized):
+        total = len(items)
     shown = display(HTML(escape(desc)), display_id=True)
     last_s = 0.0
     try:
         for done, item in enumerate(items):
             if (now_s := time.monotonic()) - last_s > EVERY_S:
                 last_s = now_s
-                value = "" if every is None else f' value="{done}"'
-                count = f"{done}" if every is None else f"{done} of {every}"
-                shown.update(HTML(f"<progress{value}{most}></progress> {escape(desc)} {count}"))
+                bar = f"<progress></progress> {escape(desc)} {done}"
+                if total is not None:
+                    bar = f'<progress value="{done}" max="{total}"></progress> {escape(desc)} {done} of {total}'
+                shown.update(HTML(bar))
             yield item
     finally:
         shown.update(HTML(""))

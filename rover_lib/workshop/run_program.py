@@ -27,6 +27,6 @@ def run(*command: object, error: type[RoverError] = RoverError, remedy: str = ""
     return done.stdout
 
 
-def last_words(text: str, lines: int = LAST_LINES) -> str:
+def last_words(text: str) -> str:
     """The last lines that a program printed, joined to one line."""
-    return " | ".join(text.strip().splitlines()[-lines:]) or "it printed nothing"
+    return " | ".join(text.strip().splitlines()[-LAST_LINES:]) or "it printed nothing"

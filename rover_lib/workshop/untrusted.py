@@ -16,6 +16,7 @@ from rover_lib.onboard.stage import read_plain
 
 JSON_BYTES = 60_000_000  # an hour and a half of driving
 LONGEST = 60  # characters of one value
+QUOTED = 6  # values
 LARGEST = 10**20  # Python refuses to print an integer of thousands of digits
 MEMORY_BYTES = 450_000_000  # a frame of 4608x2592 takes 36 MB; a decoder holds a few
 STATM = Path("/proc/self/statm")
@@ -170,8 +171,8 @@ def quote(value: object) -> str:
     return f"a {type(value).__name__}{length}"
 
 
-def quote_all(values: Iterable[object], most: int = 6) -> str:
+def quote_all(values: Iterable[object]) -> str:
     """The first values, separated by commas, names without quotes, and how many more there are."""
     values = list(values)
-    names = [v if isinstance(v, str) and v.isprintable() and len(v) <= LONGEST else quote(v) for v in values[:most]]
-    return ", ".join(names) + (f" and {len(values) - most} more" if len(values) > most else "")
+    names = [v if isinstance(v, str) and v.isprintable() and len(v) <= LONGEST else quote(v) for v in values[:QUOTED]]
+    return ", ".join(names) + (f" and {len(values) - QUOTED} more" if len(values) > QUOTED else "")

@@ -10,6 +10,7 @@ import shutil
 import sys
 import tempfile
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from rover_lib.onboard.errors import RoverError
@@ -80,7 +81,7 @@ def _fetch(folder: Path, python: str, requirements: Path) -> None:
         f.write("\n".join(re.sub(r"\s;[^\\]*", " ", line) for line in lines) + "\n")
         f.flush()
         pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", "download", "--dest", folder]
-        platforms = [o for p in PLATFORMS for o in ("--platform", p)]
+        platforms = chain.from_iterable(("--platform", p) for p in PLATFORMS)
         target = ["--python-version", python, "--implementation", "cp", *platforms]
         pins = ["--require-hashes", "--no-deps", "--only-binary", ":all:", "--requirement", f.name]
         remedy = f"is there internet here? pip fetches the wheels of {requirements.name} for Python {python}"

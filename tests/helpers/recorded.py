@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,21 @@ import pytest
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
+from rover_lib.workshop.recordings.samples import Sample
 from tests.helpers.policies import smooth_frame
 
 REPO = Path(__file__).resolve().parents[2]
 BESIDE = (REPO, *REPO.parents[:2])  # where shared/ may be
+
+
+@dataclass(frozen=True, eq=False)
+class PictureSample(Sample):
+    """A sample whose picture is in memory."""
+
+    picture: np.ndarray | None = None
+
+    def frame_bgr(self, least: int = 0) -> np.ndarray:
+        return self.turned(self.picture)
 
 
 def real_episode() -> Path:

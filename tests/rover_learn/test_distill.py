@@ -80,10 +80,8 @@ def test_killed_twice_in_the_middle_it_goes_on_and_gives_the_same(
 @pytest.mark.slow
 def test_a_student_of_half_the_channels_keeps_its_zeros(car_policy, episodes, recipe, tmp_path, monkeypatch):
     """They stay zero in all phases, through an interrupt."""
-    shape, arguments = (
-        StudentShape(backbone_channels=0.5),
-        {"runs_dir": tmp_path, "recipe": recipe, "machine": Machine.of("cpu")},
-    )
+    shape = StudentShape(backbone_channels=0.5)
+    arguments = {"runs_dir": tmp_path, "recipe": recipe, "machine": Machine.of("cpu")}
     save_each_step(monkeypatch, distill_module)
     steps = interrupt(monkeypatch, training, "descend", at=2)
     with pytest.raises(KeyboardInterrupt):

@@ -21,8 +21,8 @@ def test_a_mirrored_view_has_its_steering_negated_and_its_throttle_not(tmp_path,
     config = SimpleNamespace(image_sizes=((2, 3),), grid=lambda h, w: (1, 1))
     teacher = SimpleNamespace(weights={"encoder_img_feat_input_proj.weight": torch.zeros(4, 8)})
     lessons = Lessons.open(tmp_path, (), config, teacher, np.random.default_rng(0))
-    assert lessons.asked.tolist() == [[0.5, 0], [-0.5, 0], [0.25, 0], [-0.25, 0]]
-    lessons = Lessons(lessons.data, lessons.asked, None, None, np.zeros((4, 4, 2), np.float32), None)
+    assert lessons.teacher_states.tolist() == [[0.5, 0], [-0.5, 0], [0.25, 0], [-0.25, 0]]
+    lessons = Lessons(lessons.data, lessons.teacher_states, None, None, np.zeros((4, 4, 2), np.float32), None)
     rows, views = np.array([0, 1]), np.array([1 - MIRRORED, MIRRORED])
     for new in (False, True):
         shown = lessons.show(rows, views, new, np.random.default_rng(0))

@@ -13,6 +13,7 @@ from lerobot.policies.act.modeling_act import ACTPolicy
 from rover_learn import act_phases
 from rover_learn import train as train_module
 from rover_learn import training as training_module
+from rover_learn.act_phases import Overrides
 from rover_learn.backbone import IMAGENET, Pretrained
 from rover_learn.train import SIZES, train
 from rover_learn.training import Machine
@@ -124,7 +125,9 @@ def test_what_a_lost_gpu_began_goes_on_or_is_said_to_begin_anew(
     assert ["begins anew" in words for words in said] == [False, False, True][: 2 + anew]
 
 
-@pytest.mark.parametrize("wrong", [{"size": "huge"}, {"device": "tpu"}, {"steps": 0}, {"seed": -1}, {"episodes": "."}])
+@pytest.mark.parametrize(
+    "wrong", [{"size": "huge"}, {"device": "tpu"}, {"overrides": Overrides(0)}, {"seed": -1}, {"episodes": "."}]
+)
 def test_what_cannot_be_trained_is_refused(drives, tmp_path, wrong, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(RoverError):
@@ -256,13 +259,11 @@ def test_pictures_that_show_nothing_are_named_before_a_training(tmp_path, monkey
 def test_a_throttle_that_hardly_varies_and_was_not_learned_is_held(varies, errors, is_held):
     head = torch.nn.Linear(3, 2)
     policy = SimpleNamespace(model=SimpleNamespace(action_head=head))
-    judges = SimpleNamespace(
-        varies=np.array([True, varies]), blind_pct=np.array([8.0, 5.0]), names=["steering", "throttle"]
-    )
+    blind_pct = np.array([8.0, 5.0])
+    judges = SimpleNamespace(varies=np.array([True, varies]), blind_pct=blind_pct, names=["steering", "throttle"])
     said = []
     act_phases._hold(policy, judges, np.array(errors), np.array([0.1, 0.4], np.float32), said.append)
     planned = head(torch.rand(5, 3))
-    assert torch.allclose(planned[:, 1], torch.tensor(0.4)) == is_held and not torch.allclose(
-        planned[:, 0], torch.tensor(0.1)
-    )
+    assert torch.allclose(planned[:, 1], torch.tensor(0.4)) == is_held
+    assert not torch.allclose(planned[:, 0], torch.tensor(0.1))
     assert said == (["throttle hardly varies, and is held at 0.400"] if is_held else [])

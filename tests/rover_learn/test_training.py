@@ -135,9 +135,8 @@ def learn(folder, steps, loss, best=None):
     """A phase of a network of one weight, which it returns."""
     model, rng = nn.Linear(1, 1), np.random.default_rng(0)
     with Resumable(folder, CPU) as saved:
-        saved.train(
-            Phase("p", steps, 0.1), model, rng, lambda _: torch.ones(1, 1), lambda x: loss(model(x)), best(model)
-        )
+        phase = Phase("p", steps, 0.1)
+        saved.train(phase, model, rng, lambda _: torch.ones(1, 1), lambda x: loss(model(x)), best(model))
     return model.weight.item()
 
 

@@ -25,7 +25,7 @@ from rover_lib.workshop.checkpoint.files import CORRECT_IT, RATE_HZ, as_checkpoi
 from rover_lib.workshop.checkpoint.lerobot import SIZE_OF_BASE, lerobot_folder, read_lerobot, write_lerobot
 from rover_lib.workshop.checkpoint.trainer import read_trainer, trainer_config
 from rover_lib.workshop.checkpoint.weights import Weights, tensor_bytes
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, Layout, Sample, pick_evenly
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Layout, Sample, pick_evenly, stack_chunks
 from rover_lib.workshop.untrusted import quote, quote_all
 
 FEATURE_PX = 32  # a ResNet sees one feature for 32 pixels a side
@@ -55,7 +55,7 @@ class Checkpoint:
         A trainer's file holds all of it, but what files beside it or the user say. In LeRobot's folder the config and
         the statistics are beside the weights.
         """
-        elsewhere = [by for _, by in self.facts.known.values() if by == USER or re.search(r"\.(json|ya?ml):", by)]
+        elsewhere = any(by == USER or re.search(r"\.(json|ya?ml):", by) for _, by in self.facts.known.values())
         if self.format == "trainer" and not elsewhere:
             return self.sha256
         config = asdict(self.config)
@@ -101,11 +101,12 @@ class Checkpoint:
                 raise facts.refusal(key, value, "and nobody here knows what that does")
         guessed = [fact for fact in ("actions", "rate") if facts.source(fact) == GUESS]
         if guessed and not has_rate:  # our own recordings, which it was not trained on
-            say = " ".join({"actions": "actions=steering,throttle", "rate": "rate=30"}[fact] for fact in guessed)
-            problem = f"{self.path}: nothing says its {' and '.join(guessed)}"
+            examples = {"actions": "actions=steering,throttle", "rate": "rate=30"}
+            example = " ".join(examples[fact] for fact in guessed)
             # Both orders: the user must not just copy one.
-            other = say.replace("steering,throttle", "throttle,steering")
-            options = " or ".join(f'{USER} "{option}"' for option in dict.fromkeys((say, other)))
+            other = example.replace("steering,throttle", "throttle,steering")
+            options = " or ".join(f'{USER} "{option}"' for option in dict.fromkeys((example, other)))
+            problem = f"{self.path}: nothing says its {' and '.join(guessed)}"
             raise CheckpointError(problem, remedy=f"{TRAINED_ON}, or say them in its numbers' order: {options}")
         if has_rate and "rate" not in guessed and layout.rate_hz != c.rate_hz:
             actual = f"recordings of {layout.rate_hz:g} frames a second"
@@ -146,8 +147,9 @@ class Checkpoint:
         facts: dict[str, tuple[Any, str]] = {"actions": (layout.action_names, self.facts.source("actions"))}
         if guessed:
             same = self._varies_as(samples, actions, "actions" in guessed)
-            cameras = c.cameras if set(c.cameras) == set(layout.cameras) else layout.cameras
-            if c.cameras != cameras:
+            cameras = c.cameras
+            if set(cameras) != set(layout.cameras):
+                cameras = layout.cameras
                 notes.append(f"its cameras are {quote_all(c.cameras)}, and the recordings' are {quote_all(cameras)}")
             if len(actions) == 2 and set(layout.action_names) != set(ACTION_NAMES):
                 option = "if they are steering and throttle, name them so in their order: --action-names"
@@ -218,7 +220,10 @@ class Checkpoint:
         if sizes == c.image_sizes:
             return self
         config = replace(c, image_sizes=sizes)
-        own, other = (planned_error(replace(self, config=option), tried) if tried else 1.0 for option in (c, config))
+        own = other = 1.0
+        if tried:
+            own = planned_error(self, tried)
+            other = planned_error(replace(self, config=config), tried)
         # Nobody squeezes a copy, so then the recordings' size is likelier.
         best = config if other <= BETTER * own or (squeezed and BETTER * other < own) else c
         errors = f"they are {own:.3g} and {other:.3g} off"
@@ -236,8 +241,8 @@ class Checkpoint:
 def planned_error(policy: Checkpoint, samples: Sequence[Sample], action: int | None = None) -> float:
     """The mean error of one action, or of all, against the recorded ones."""
     plans = predictions(ACT(policy.config, policy.weights), [inputs_of(s, policy.config) for s in samples]).numpy()
-    present = ~np.stack([s.is_pad for s in samples])
-    errors = np.abs(plans - np.stack([s.chunk for s in samples]))[present]
+    chunks, is_pad = stack_chunks(samples)
+    errors = np.abs(plans - chunks)[~is_pad]
     return float((errors if action is None else errors[:, action]).mean())
 
 

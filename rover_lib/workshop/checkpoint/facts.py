@@ -39,8 +39,10 @@ class Facts:
 
     def __init__(self, path: Path, said: str = ""):
         """said: what the user says, such as "rate=20 actions=throttle,steering size=64x48 ignore=KEY,KEY"."""
-        self.path, self.notes = path, list[str]()
-        self.known, self.unknown = dict[str, tuple[Any, str]](), dict[str, Any]()
+        self.path = path
+        self.notes: list[str] = []
+        self.known: dict[str, tuple[Any, str]] = {}
+        self.unknown: dict[str, Any] = {}
         try:
             overrides = dict(part.split("=", 1) for part in said.split())
             self.ignored = {*overrides.pop("ignore", "").split(",")}
@@ -143,7 +145,9 @@ class _Key:
     """A key that nobody here knows. words: of its name and of a text as its value; last: of its name's last part."""
 
     def __init__(self, name: str, value: Any):
-        self.name, self.value, self.last = name, value, words_of(re.split("[.:]", name)[-1])
+        self.name = name
+        self.value = value
+        self.last = words_of(re.split("[.:]", name)[-1])
         self.words = words_of(name) | (words_of(value) if isinstance(value, str) else set())  # action_type: delta
         self.several = isinstance(value, (list, tuple)) and len(value) > 1
         self.is_label = self.has("labels") and not self.several  # the name of a run may have any words

@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import astuple, fields, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -57,7 +58,7 @@ def lerobot_folder(path: Path) -> Path:
         if (path / inner / "config.json").exists():
             return path / inner
     places = (f"*/{PRETRAINED}", f"checkpoints/*/{PRETRAINED}", "snapshots/*", "*.pth")
-    actual = sorted(p.relative_to(path).as_posix() for place in places for p in path.glob(place))
+    actual = sorted(p.relative_to(path).as_posix() for p in chain.from_iterable(map(path.glob, places)))
     problem = f"{path}: no config.json, nor a link to the last checkpoint"
     remedy = "give best_model.pth, or one pretrained_model folder with config.json; merge an adapter before"
     raise CheckpointError(problem, found=quote_all(actual) or "none", remedy=remedy)
@@ -70,13 +71,15 @@ def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
         raise CheckpointError(problem, remedy="merge it (merge_and_unload), save_pretrained, and remove its files")
     raw = _of_today(folder, _read_json(folder / CONFIG))
     settings = _act_config(folder, raw, facts)
-    tensors, inside = (name_weights(folder, _read_safetensors(folder / WEIGHTS), facts.ignored), dict[str, Tensor]())
-    # Statistics of before LeRobot had processors.
-    for key in () if (folder / OUTER[0]).exists() else (*settings.input_features, *settings.output_features):
-        for name in [n for n in tensors if re.search(IN_WEIGHTS.format(key=key.replace(".", "_")), n)]:
-            inside[f"{key}.{name.rpartition('.')[2]}"] = tensors.pop(name)
+    tensors = name_weights(folder, _read_safetensors(folder / WEIGHTS), facts.ignored)
+    inside: dict[str, Tensor] = {}
+    if not (folder / OUTER[0]).exists():  # of before LeRobot had processors
+        for key in (*settings.input_features, *settings.output_features):
+            for name in [n for n in tensors if re.search(IN_WEIGHTS.format(key=key.replace(".", "_")), n)]:
+                inside[f"{key}.{name.rpartition('.')[2]}"] = tensors.pop(name)
     weights = check_weights_are_whole(folder, tensors)
-    inner, outer = Normaliser(folder, *INNER, settings, inside), Normaliser(folder, *OUTER, settings, inside)
+    inner = Normaliser(folder, *INNER, settings, inside)
+    outer = Normaliser(folder, *OUTER, settings, inside)
     origin = _read_json(folder / ORIGIN) if (folder / ORIGIN).exists() else {}  # what we noted in one that we wrote
     images = settings.image_features
     numbers = settings.robot_state_feature
@@ -109,8 +112,7 @@ def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
             action_unnorm=norms.get(OUTER[0]) or outer.affine("action", "ACTION", actions.shape, inverse=True),
             **{ours: getattr(settings, theirs) for ours, theirs in LEROBOTS.items()},
         )
-        if config.state_norm is not None:
-            config, weights = _without_constants(config, weights, inner, facts)
+        config, weights = _without_constants(config, weights, inner, facts)
         _compare_statistics(config, inner, outer, facts)
     files.check_beside(folder, facts)
     report = {"optimizer_mb": 0.0, "written_here": bool(origin)}
@@ -125,10 +127,10 @@ def _without_constants(
     Its network learned nothing from them, and their scale of 1e8 would make anything of a car's last action.
     """
     norm = config.state_norm
-    constants = inner.constants("observation.state", config.state_norm)
-    if norm is None or not constants:
+    if norm is None or not (constants := inner.constants("observation.state", norm)):
         return config, weights
-    weights, dropped = dict(weights), list(constants)
+    weights = dict(weights)
+    dropped = list(constants)
     for stem in ("encoder_robot_state_input_proj", "vae_encoder_robot_state_input_proj"):
         if f"{stem}.weight" in weights:
             columns = weights[f"{stem}.weight"].clone()
@@ -153,10 +155,9 @@ def _compare_statistics(config: ActConfig, inner: "Normaliser", outer: "Normalis
     for name, (mean, std), (own_mean, own_std) in zip(config.state_names, state, action, strict=True):
         alike = abs(mean - own_mean) <= APART * own_std and own_std <= APART * std and std <= APART * own_std
         if min(std, own_std) > VARIES and not alike:
-            problem = f"mean {mean:.3g}, deviation {std:.3g}, and its action's {own_mean:.3g}, {own_std:.3g}"
-            facts.notes.append(
-                f"the state that it learned from was not its last action, which a car gives: {name} {problem}"
-            )
+            problem = "the state that it learned from was not its last action, which a car gives"
+            state_words = f"{name} mean {mean:.3g}, deviation {std:.3g}"
+            facts.notes.append(f"{problem}: {state_words}, and its action's {own_mean:.3g}, {own_std:.3g}")
             return
 
 
@@ -224,7 +225,7 @@ def _act_config(folder: Path, raw: dict[str, Any], facts: Facts) -> "ACTConfig":
         decoded = draccus.decode(ACTConfig, {k: v for k, v in raw.items() if k in options} | {"device": "cpu"})
         cameras = [tuple(camera.shape) for camera in decoded.image_features.values()]
         rows = [tuple(row.shape) for row in (decoded.robot_state_feature, decoded.action_feature) if row]
-        whole = all(is_whole(n, 1, files.MOST) for shape in (*cameras, *rows) for n in shape)
+        whole = all(is_whole(n, 1, files.MOST) for n in chain(*cameras, *rows))
         right = all(len(s) == 3 and s[0] == 3 for s in cameras) and all(len(s) == 1 for s in rows)
     if not (cameras and decoded.action_feature and whole and right) or decoded.env_state_feature:
         features = {**decoded.input_features, **decoded.output_features}
@@ -284,13 +285,11 @@ class Normaliser:
         parts = [stats[name].flatten().tolist() for part in ("mean", "std") if (name := f"{key}.{part}") in stats]
         return list(zip(*parts, strict=True)) if len(parts) == 2 else []
 
-    def constants(self, key: str, norm: Affine | None) -> dict[int, float]:
+    def constants(self, key: str, norm: Affine) -> dict[int, float]:
         """Return the numbers of an input that never varied in training, by their place, as the network saw them.
 
         Raises CheckpointError for those that varied, and whose quantiles were equal.
         """
-        if norm is None:
-            return {}
         fixed = [i for i, (a, b) in enumerate(zip(norm.scale, norm.shift, strict=True)) if VARIES * max(a, abs(b)) >= 1]
         mode = self.step.norm_map[self.step.features[key].type].value
         varied = [i for i in fixed if (pairs := self.statistics(key)) and pairs[i][1] > VARIES]

@@ -52,10 +52,10 @@ WIDENING_ROUNDS = 3
 def mae_pct(errors: Tensor, weights: Tensor, action_range: Mapping[str, Range]) -> Errors:
     """Weighted mean of (frames, actions) errors, in percent of the recorded range, as {<action>_mae_pct: value}."""
     error = (weights[:, None] * errors).sum(0) / weights.sum()
-    return {
-        f"{name}_mae_pct": pct_of_range(e.item(), recorded)
-        for (name, recorded), e in zip(action_range.items(), error, strict=True)
-    }
+    errors_pct = {}
+    for (name, recorded), of_action in zip(action_range.items(), error, strict=True):
+        errors_pct[f"{name}_mae_pct"] = pct_of_range(of_action.item(), recorded)
+    return errors_pct
 
 
 class Chooser:
@@ -150,11 +150,10 @@ class Chooser:
     def _widen(self, scheme: Scheme, errors: Callable[[Scheme], Tensor], progress: Progress) -> tuple[Scheme, Errors]:
         """Let the tensors whose odd frames reach furthest reach further, one step at a time, while all frames gain."""
         frames = self.calibration.frames
-        usual_frames = usual(self.calibration.frames, scheme.usual_pct)
-        further = {
-            place: extremes.abs().max() / extremes[usual_frames].abs().max().clamp(min=1e-6)
-            for place, extremes in frames.items()
-        }
+        usual_frames = usual(frames, scheme.usual_pct)
+        further = {}
+        for place, extremes in frames.items():
+            further[place] = extremes.abs().max() / extremes[usual_frames].abs().max().clamp(min=1e-6)
         places = sorted(further, key=lambda place: -further[place])[:WIDENED]
 
         def judge(scheme: Scheme) -> tuple[Errors, float]:

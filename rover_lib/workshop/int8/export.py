@@ -29,7 +29,7 @@ from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8.familiar import Drives, fit
 from rover_lib.workshop.int8.observe import Calibration
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, graph_of, int8_layers, with_embedding
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, Sample, car_of
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Sample, by_camera, car_of
 
 BATCH = 8
 KEPT = 2**28  # bytes of pictures that are prepared once for all modes; larger ones take far longer to plan from
@@ -127,7 +127,8 @@ class Exporter:
     def __init__(self, checkpoint: Checkpoint, samples: Sequence[Sample]):
         if not samples:
             raise ArtifactError("an artifact needs parity vectors", found="no samples", remedy="give at least one")
-        self.checkpoint, self.parity = checkpoint, params()["parity"]
+        self.checkpoint = checkpoint
+        self.parity = params()["parity"]
         self.car = car_of(samples)
         self.recorded = recorded_shapes(samples[0], checkpoint.config)
         self.float_policy = ACT(checkpoint.config, checkpoint.weights)
@@ -178,10 +179,9 @@ class Exporter:
                 raise ArtifactError(f"{path}: {name} of the written graph differs by {gap:.3g}; nothing was written")
         manifest = self._manifest(policy, calibration, form)
         # The gates judge what INT8 loses. A rover refuses a tolerance so large that another plan would pass.
-        tolerance = {
-            name: min(limit, artifact.largest_tolerance(manifest["mode"], name))
-            for name, limit in self._tolerance(policy, actions, np.arange(len(actions))).items()
-        }
+        tolerance = {}
+        for name, limit in self._tolerance(policy, actions, np.arange(len(actions))).items():
+            tolerance[name] = min(limit, artifact.largest_tolerance(manifest["mode"], name))
         manifest["parity"] = {"tolerance": tolerance, "reason": REASONS[isinstance(policy, QuantizedPolicy)]}
         states, *frames = zip(*(self.inputs[i] for i in self.stored), strict=True)
         vectors = {"state": np.concatenate(states), "chunk": actions[self.stored].numpy()}
@@ -218,24 +218,23 @@ class Exporter:
     def _manifest(self, policy: ACT | QuantizedPolicy, calibration: Calibration | None, form: Form) -> dict[str, Any]:
         """Return the manifest without its parity."""
         config = self.checkpoint.config
-        scheme = getattr(policy, "scheme", None)
+        scheme: Any = getattr(policy, "scheme", None)
         mode = scheme.mode if scheme else "fp32"
-        static = scheme if mode in ("static", "mixed") else None
+        kind = {"fp32": "float", "dynamic": "dynamic"}.get(mode, "symmetric")
         calibrated = calibration and {
             "samples": calibration.samples,
-            "observer": static.observer if static else None,
+            "observer": None if kind == "dynamic" else scheme.observer,
             "channel_scales": calibration.smooth,
-            "float_blocks": list(scheme.float_blocks) if scheme else [],
+            "float_blocks": list(scheme.float_blocks),
         }
-        cameras = [
-            {"name": n, "height": h, "width": w} | self.recorded[n]
-            for n, (h, w) in zip(config.cameras, config.image_sizes, strict=True)
-        ]
+        cameras = []
+        for name, (height, width) in zip(config.cameras, config.image_sizes, strict=True):
+            cameras.append({"name": name, "height": height, "width": width} | self.recorded[name])
         names_car = not self.car.drives_like(Car()) and bool({*config.action_names} & {*ACTION_NAMES})
         return {
             "schema": artifact.SCHEMA,
             "mode": mode,
-            "scheme": "symmetric" if static else "dynamic" if scheme else "float",
+            "scheme": kind,
             "engine": form.engine,
             "cameras": cameras,
             "state_names": list(config.state_names),
@@ -264,10 +263,10 @@ class Exporter:
 
 def recorded_shapes(sample: Sample, config: ActConfig) -> dict[str, dict[str, Any]]:
     """Return {"recorded": [height, width]} for each camera whose recorded pictures were squeezed for the policy."""
-    frame: Any = sample.frame_bgr()
+    frames = by_camera(sample.frame_bgr(), config.cameras[0])
     shapes = {}
     for name, (h, w) in zip(config.cameras, config.image_sizes, strict=True):
-        height, width = (frame[name] if isinstance(frame, Mapping) else frame).shape[:2]
+        height, width = frames[name].shape[:2]
         shapes[name] = {"recorded": [height, width]} if is_squeezed((width, height), (w, h)) else {}
     return shapes
 

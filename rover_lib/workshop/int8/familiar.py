@@ -113,9 +113,8 @@ def fit(drives: Drives, embed: Callable[[Sample], np.ndarray]) -> tuple[Familiar
     smallest = []
     for name in sorted(shares, key=lambda name: -shares[name])[:SHOWN]:
         sample = drives.unseen[name][int(scores[name].argmax())]
-        smallest.append(
-            {"episode": sample.episode, "row": sample.row, "frame": sample.frame_name, "strange": shares[name]}
-        )
+        place = {"episode": sample.episode, "row": sample.row, "frame": sample.frame_name}
+        smallest.append(place | {"strange": shares[name]})
     rate = {"stopped_pct": 100 / (len(shares) + 1), "stopped_low_pct": 100 * low, "stopped_high_pct": 100 * high}
     return familiar, {"drives": len(shares), "each": drives.each, **rate, "largest": shares, "least": smallest}
 

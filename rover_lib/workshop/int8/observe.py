@@ -10,7 +10,6 @@ import re
 import time
 import warnings
 from collections.abc import Iterable, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -29,6 +28,7 @@ from rover_lib.workshop.act import ACT, Columns, blocks, example_inputs, inputs_
 from rover_lib.workshop.act_config import ActConfig
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.checkpoint.files import save_torch
+from rover_lib.workshop.hooks import watched
 from rover_lib.workshop.int8.frames import Frame, range_over, usual
 from rover_lib.workshop.int8.scales import Maxima, apply_channel_scales, channel_maxima
 from rover_lib.workshop.int8.scheme import ENGINE, HIGH, LOW, OBSERVERS, SMALLEST_SCALE, Scheme
@@ -38,6 +38,7 @@ from rover_lib.workshop.recordings.samples import Sample
 AGAIN = "calibrate again"
 BROKEN_INPUT = "check the checkpoint and the recordings"
 OBSERVER = "activation_post_process"  # in FX's names of observers
+SHOWN_PCT = 95.0  # of the frames, whose extremes the observer `frames` takes where its ranges are only shown
 
 
 class RangeObserver(UniformQuantizationObserverBase):
@@ -209,13 +210,11 @@ def times_of(prepared: GraphModule, calibration: Calibration, inputs: Sequence[t
     """(frames,) of each frame's oddness, as `frames.oddest`, against the frames that calibrated."""
     times = torch.zeros(len(inputs))
     usually = {place: extreme.abs().amax(1).median().clamp(min=1e-12) for place, extreme in calibration.frames.items()}
-    with ExitStack() as hooks:
-        for place, observer in _places(prepared).items():
 
-            def watch(_: nn.Module, args: tuple[Tensor], __: Tensor, usually: Tensor = usually[place]) -> None:
-                times[i] = torch.maximum(times[i], args[0].abs().max() / usually)
+    def watch(place: str, _: nn.Module, inputs: tuple[Tensor], __: Tensor) -> None:
+        times[i] = torch.maximum(times[i], inputs[0].abs().max() / usually[place])
 
-            hooks.enter_context(observer.register_forward_hook(watch))
+    with watched(_places(prepared), watch):
         for i, x in enumerate(inputs):  # noqa: B007 watch reads it
             prepared(*x)
     return times
@@ -230,25 +229,25 @@ def set_ranges(prepared: GraphModule, scheme: Scheme, calibration: Calibration) 
         observer.of_frames = range_over(calibration.frames[place], usual_frames, wider.get(place, 0.0))
 
 
-def ranges_of(
-    checkpoint: Checkpoint, calibration: Calibration, usual_pct: float = 95.0
-) -> dict[str, dict[str, tuple[float, float, float]]]:
+def ranges_of(checkpoint: Checkpoint, calibration: Calibration) -> dict[str, dict[str, tuple[float, float, float]]]:
     """What each observer would keep of each tensor: {place: {observer: (low, high, values clipped in %)}}.
 
-    usual_pct: the share of frames whose extremes the observer `frames` takes here. Raises as `restore_observed`.
+    Raises as `restore_observed`.
     """
-    found: dict[str, dict[str, tuple[float, float, float]]] = {}
+    ranges: dict[str, dict[str, tuple[float, float, float]]] = {}
     scheme = Scheme(smooth=calibration.smooth)
     prepared = restore_observed(checkpoint, scheme, calibration)
     for choice in OBSERVERS:
-        set_ranges(prepared, replace(scheme, observer=choice, usual_pct=usual_pct), calibration)
+        set_ranges(prepared, replace(scheme, observer=choice, usual_pct=SHOWN_PCT), calibration)
         for place, observer in _places(prepared).items():
             low, high = observer.range()
-            centres, counts = observer._centres(), observer.histogram
-            outside = counts[(centres < low) | (centres > high)].sum() / counts.sum().clamp(min=1)
-            exact = choice == "minmax"  # whose ends lie within the histogram's last bins
-            found.setdefault(place, {})[choice] = (low, high, 0.0 if exact else 100 * float(outside))
-    return found
+            centres = observer._centres()
+            counts = observer.histogram
+            clipped = float(counts[(centres < low) | (centres > high)].sum() / counts.sum().clamp(min=1))
+            if choice == "minmax":
+                clipped = 0.0  # its ends lie within the histogram's last bins
+            ranges.setdefault(place, {})[choice] = (low, high, 100 * clipped)
+    return ranges
 
 
 def _observer(prepared: nn.Module, node: Node) -> RangeObserver | None:

@@ -13,7 +13,6 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -32,6 +31,7 @@ from rover_lib.onboard.policy.load import give_back_freed
 from rover_lib.workshop.act import ACT, Columns, block_of, example_inputs, inputs_of
 from rover_lib.workshop.act_config import ActConfig
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
+from rover_lib.workshop.hooks import watched
 from rover_lib.workshop.int8 import observe
 from rover_lib.workshop.int8.observe import AGAIN, Calibration, restore_observed, scale_model
 from rover_lib.workshop.int8.scales import projections
@@ -105,14 +105,12 @@ def check_fast(module: nn.Module, example: tuple[Tensor, ...]) -> None:
     """Raise ArtifactError, naming the layers, unless every static INT8 layer dispatches to XNNPACK's SDOT kernels."""
     slow: list[str] = []
     static = int8_layers(module)
-    with ExitStack() as hooks:
-        for name, layer in static.items():
 
-            def watch(m: Int8Layer, args: tuple[Tensor, ...], name: str = name) -> None:
-                if not _is_fast(m, args[0]):
-                    slow.append(name)
+    def watch(name: str, layer: Int8Layer, inputs: tuple[Tensor, ...]) -> None:
+        if not _is_fast(layer, inputs[0]):
+            slow.append(name)
 
-            hooks.enter_context(layer.register_forward_pre_hook(watch))
+    with watched(static, watch, before=True):
         try:
             module(*example)
         except RuntimeError as e:
@@ -193,18 +191,18 @@ def most_clipped(
     samples: which calibration should not have seen.
     """
     prepared = restore_observed(checkpoint, quantized.scheme, calibration)
+    layers = int8_layers(quantized.module)
     clipped = Counter[str]()
     totals = Counter[str]()
-    with ExitStack() as hooks:
-        for name, m in int8_layers(quantized.module).items():
-            ends = (LOW - m.zero_point - 0.5) * m.scale, (HIGH - m.zero_point + 0.5) * m.scale
 
-            def watch(_: nn.Module, __: Any, x: Tensor, n: str = name, ends: tuple[float, float] = ends) -> None:
-                floor, ceiling = ends
-                clipped[n] += int(((x < floor) | (x > ceiling)).sum())
-                totals[n] += x.numel()
+    def watch(name: str, _: nn.Module, __: Any, x: Tensor) -> None:
+        layer = layers[name]
+        floor = (LOW - layer.zero_point - 0.5) * layer.scale
+        ceiling = (HIGH - layer.zero_point + 0.5) * layer.scale
+        clipped[name] += int(((x < floor) | (x > ceiling)).sum())
+        totals[name] += x.numel()
 
-            hooks.enter_context(prepared.get_submodule(name).register_forward_hook(watch))
+    with watched({name: prepared.get_submodule(name) for name in layers}, watch):
         for s in samples:
             prepared(*inputs_of(s, checkpoint.config))
     shares = {name: 100 * clipped[name] / count for name, count in totals.items()}

@@ -4,13 +4,13 @@ Activations have one scale per tensor, so a channel ten times larger than the re
 """
 
 from collections.abc import Iterable
-from contextlib import ExitStack
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from rover_lib.workshop.act import ACT, Attention, FeedForward, Projection
+from rover_lib.workshop.hooks import watched
 
 Maxima = dict[str, dict[str, Tensor]]  # by projection: in_max and out_max, the largest magnitude of each channel
 
@@ -25,21 +25,19 @@ def projections(model: ACT) -> dict[str, Projection]:
 @torch.inference_mode()
 def channel_maxima(model: ACT, inputs: Iterable[tuple[Tensor, ...]]) -> Maxima:
     """The largest magnitude per channel at each projection's input and output: {name: {in_max, out_max}}."""
-    maxima: Maxima = {}
-    with ExitStack() as hooks:
-        for name, layer in projections(model).items():
-            seen = maxima[name] = {}
+    layers = projections(model)
+    maxima: Maxima = {name: {} for name in layers}
 
-            def watch(_: nn.Module, args: tuple[Tensor], out: Tensor, seen: dict[str, Tensor] = seen) -> None:
-                for key, x in (("in_max", args[0]), ("out_max", out)):
-                    # of (1, channels, h, w), or (1, tokens, channels)
-                    largest = x.abs().amax((0, 2, 3) if x.dim() == 4 else (0, 1))
-                    seen[key] = torch.maximum(seen[key], largest) if key in seen else largest
+    def watch(name: str, _: nn.Module, inputs: tuple[Tensor], output: Tensor) -> None:
+        for key, x in (("in_max", inputs[0]), ("out_max", output)):
+            # of (1, channels, h, w), or (1, tokens, channels)
+            largest = x.abs().amax((0, 2, 3) if x.dim() == 4 else (0, 1))
+            maxima[name][key] = torch.maximum(maxima[name].get(key, largest), largest)
 
-            hooks.enter_context(layer.register_forward_hook(watch))
+    with watched(layers, watch):
         for x in inputs:
             model(*x)
-    return {name: {key: t.clone() for key, t in seen.items()} for name, seen in maxima.items()}
+    return maxima
 
 
 def apply_channel_scales(model: ACT, maxima: Maxima, smooth: float) -> None:

@@ -1,7 +1,7 @@
 """How to quantize, as a value: what `observe` prepares for, `quantize` carries out and `choose` tries."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from rover_lib.onboard.errors import ArtifactError
@@ -35,10 +35,9 @@ class Scheme:
 
     @classmethod
     def of(cls, stored: Mapping[str, Any]) -> "Scheme":
-        """A scheme from JSON, which has lists for its tuples, and of older versions more than a scheme has now."""
-        wider = tuple((place, share) for place, share in stored.get("wider", ()))
-        values = {entry.name: stored[entry.name] for entry in fields(cls) if entry.name in stored}
-        return cls(**{**values, "float_blocks": tuple(stored["float_blocks"]), "wider": wider})
+        """A scheme from JSON, which has lists for its tuples."""
+        tuples = {"float_blocks": tuple(stored["float_blocks"]), "wider": tuple(map(tuple, stored["wider"]))}
+        return cls(**{**stored, **tuples})
 
     def __post_init__(self) -> None:
         choices = {"mode": MODES, "observer": OBSERVERS}

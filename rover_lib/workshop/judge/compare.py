@@ -28,6 +28,7 @@ from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.judge.pairs import compare_pairs, loses
 from rover_lib.workshop.judge.recorded_range import not_judged, pct_of_range, worst
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.samples import by_camera, stack_chunks
 
 MODES = ("dynamic", "static", "mixed")  # what a run makes beside fp32
 ARTIFACTS = ("fp32", *MODES)
@@ -135,7 +136,7 @@ class LerobotEager:
     def predict_chunk(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray], state: np.ndarray) -> np.ndarray:
         """As `Policy.predict_chunk`: (C, A) float32, clipped to what a pulse can express."""
         c = self.config
-        frames = frame_bgr if isinstance(frame_bgr, Mapping) else {c.cameras[0]: frame_bgr}
+        frames = by_camera(frame_bgr, c.cameras[0])
         batch = {"observation.state": _affine(np.asarray(state, np.float32), c.state_norm)[None]}
         for name, size, norm in zip(c.cameras, c.image_sizes, c.image_norm, strict=True):
             pixels = prepare_frame(frames[name], *size).astype(np.float32) / 255
@@ -198,14 +199,15 @@ def fidelity(
         frame = sample.frame_bgr()
         for mode, policy in policies.items():
             planned[mode].append(policy.predict_chunk(frame, sample.state))
+    recorded, is_pad = stack_chunks(samples)
     return Fidelity(
         action_names=names,
         action_range={n: (float(action_range[n][0]), float(action_range[n][1])) for n in names},
         samples=tuple(samples),
         reference=np.stack(planned.pop("")),
         chunks={mode: np.stack(chunks) for mode, chunks in planned.items()},
-        recorded=np.stack([s.chunk for s in samples]),
-        is_pad=np.stack([s.is_pad for s in samples]),
+        recorded=recorded,
+        is_pad=is_pad,
     )
 
 
@@ -218,8 +220,8 @@ def metrics(report: Fidelity, policies: Mapping[str, Any], trials: Mapping[str, 
     for mode in ("fp32", *report.chunks):
         trial = (trials or {}).get(mode)
         own[mode] = {
-            "hits": trial.hits if trial else None,
-            "trials": trial.trials if trial else None,
+            "hits": getattr(trial, "hits", None),
+            "trials": getattr(trial, "trials", None),
             "size_mb": policies[mode].path.stat().st_size / 1e6,
         }
     fp32 = own.pop("fp32")
@@ -285,14 +287,13 @@ def gates(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GA
     fp32 = compared["fp32"]
     scores = compared["modes"][mode]
     lost = worlds_lost(f"{mode} {WORLDS_LOST}", scores.get("pairs"), fp32.get("trials"), limits["worlds_lost_pct"])
+    hits = gate("fp32 hits", fp32["hits"], ">=", hits_needed(limits, fp32.get("trials")))
+    size = gate(f"{mode} size_mb", scores["size_mb"], "<=", limits["size_mb"][mode])
+    if lost["passed"] is not None:
+        return [hits, lost, size]
     if (ms := error_ms(compared, mode)) is not None:
         error = gate(f"{mode} error, ms of delay", ms, "<=", error_limit_ms(scores, limits))
     else:
         worst_pct = worst(scores[key] for key in scores if key.endswith("_mae_pct"))
         error = gate(f"{mode} error, % of the recorded range", worst_pct, "<=", limits["error_pct"])
-    return [
-        *([error] if lost["passed"] is None else []),
-        gate("fp32 hits", fp32["hits"], ">=", hits_needed(limits, fp32.get("trials"))),
-        lost,
-        gate(f"{mode} size_mb", scores["size_mb"], "<=", limits["size_mb"][mode]),
-    ]
+    return [error, hits, lost, size]

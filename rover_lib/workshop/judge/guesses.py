@@ -19,10 +19,9 @@ from typing import Any
 import numpy as np
 
 from rover_lib.workshop.judge.compare import Fidelity
-from rover_lib.workshop.judge.recorded_range import HELD_OFF, hardly_varies, usual_size
+from rover_lib.workshop.judge.recorded_range import HELD_OFF, hardly_varies
 from rover_lib.workshop.notebook_table import Table
-from rover_lib.workshop.recordings.blocks import group_by_block
-from rover_lib.workshop.recordings.samples import Sample
+from rover_lib.workshop.recordings.samples import Sample, block_of, stack_chunks
 
 DRAWS = 2000
 LEAST_EPISODES = 4  # of fewer, pieces are drawn instead, each as long as a plan
@@ -94,10 +93,9 @@ class Judged:
             return ["no action varies enough in these recordings to show whether the policy sees"]
         warnings = []
         for action, result in self.actions.items():
-            if lost := result.lost():
-                when = " in the later half of a plan" if lost[0] == LAST else ""
-                name = lost[0]
-                guess = result.guesses[lost[0]]
+            for name in result.lost()[:1]:
+                when = " in the later half of a plan" if name == LAST else ""
+                guess = result.guesses[name]
                 errors = f"{guess.error_pct - guess.better:.2f} % off the driver{when}, {name} {guess.error_pct:.2f} %"
                 lead = f"better by {guess.lead()} over {self.drawn}"
                 warnings.append(f"{action} is not clearly better than a guess without eyes: {errors}; {lead}")
@@ -108,12 +106,12 @@ class Judged:
 
     def notes(self) -> list[str]:
         """A sentence for each action that is held."""
-        constant = {action: result for action, result in self.actions.items() if result.held}
-        return [
-            f"{action} hardly varies in these recordings: held, not judged ({result.error_pct:.1f} % off, "
-            f"{CONSTANT} {result.guesses[CONSTANT].error_pct:.1f} %)"
-            for action, result in constant.items()
-        ]
+        notes = []
+        for action, result in self.actions.items():
+            if result.held:
+                errors = f"{result.error_pct:.1f} % off, {CONSTANT} {result.guesses[CONSTANT].error_pct:.1f} %"
+                notes.append(f"{action} hardly varies in these recordings: held, not judged ({errors})")
+        return notes
 
     def summary(self) -> dict[str, Any]:
         """The same as plain JSON types, for compare.json."""
@@ -156,7 +154,7 @@ def least_blind_errors(
     return np.asarray(errors).min(0)
 
 
-def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) -> Judged | None:
+def against_guesses(report: Fidelity, learned: Sequence[Sample]) -> Judged | None:
     """Hold the FP32 plans of a comparison and the guesses against the driver, action by action.
 
     learned: samples of other drives, which the policy could learn from; the guesses know no others. None without any.
@@ -166,8 +164,8 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) 
         return None
     recorded = report.recorded
     is_pad = report.is_pad
-    half = report.recorded.shape[1] // 2
-    blind = blind_plans(np.stack([s.chunk for s in learned]), np.stack([s.is_pad for s in learned]))
+    half = recorded.shape[1] // 2
+    blind = blind_plans(*stack_chunks(learned))
     own = frame_errors(report.reference, recorded, is_pad)
     errors = {name: frame_errors(plan, recorded, is_pad) for name, plan in blind.items()}
     compared = {MEAN_PLAN: (errors[MEAN_PLAN], own)}
@@ -177,7 +175,7 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) 
         compared[LAST] = frame_errors(states[:, None], *later), frame_errors(report.reference[:, half:], *later)
     learned_actions = np.concatenate([s.chunk[~s.is_pad] for s in learned])
     drawn, pieces = _pieces(report)
-    draws = np.random.default_rng(seed).integers(0, len(pieces), (DRAWS, len(pieces)))
+    draws = np.random.default_rng(0).integers(0, len(pieces), (DRAWS, len(pieces)))
     actions = {}
     for i, action in enumerate(report.action_names):
         if (pct := report.pct(action)) is None:
@@ -190,7 +188,7 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) 
         acted = recorded[~is_pad][:, i]
         error = own[:, i].mean()
         is_constant = hardly_varies(action, acted) or hardly_varies(action, learned_actions[:, i])
-        size = usual_size(acted)
+        size = float(np.abs(acted).mean())
         actions[action] = ActionJudged(float(pct * error), guesses, is_constant, float(error / size) if size else 0.0)
     return Judged(actions, drawn)
 
@@ -208,14 +206,16 @@ def _guess(of_guess: np.ndarray, of_policy: np.ndarray, pieces: Sequence[np.ndar
 def _pieces(report: Fidelity) -> tuple[str, list[np.ndarray]]:
     """Return what is drawn from, in words, and for each piece the numbers of its frames."""
     samples = report.samples
-    blocks = [np.array(rows) for rows in group_by_block(samples)]
+    blocks = _runs([block_of(s) for s in samples])
     one_drive_each = all(len({samples[i].episode for i in rows}) == 1 for rows in blocks)
     unit = "episode" if one_drive_each and len({s.episode for s in samples}) == len(blocks) else "block"
     if len(blocks) >= LEAST_EPISODES:
         return f"{len(blocks)} {unit}s", blocks
     chunk = report.reference.shape[1]
-    pieces = []
-    for rows in blocks:
-        parts = [(samples[row].episode, samples[row].row // chunk) for row in rows]
-        pieces += [np.array(list(group)) for _, group in groupby(rows, key=dict(zip(rows, parts, strict=True)).get)]
+    pieces = _runs([(block_of(s), s.episode, s.row // chunk) for s in samples])
     return f"{len(pieces)} pieces of {len(blocks)} {unit}{'s' if len(blocks) > 1 else ''}", pieces
+
+
+def _runs(keys: Sequence[object]) -> list[np.ndarray]:
+    """Return the numbers of the keys, for each run of equal ones."""
+    return [np.array(list(numbers)) for _, numbers in groupby(range(len(keys)), key=keys.__getitem__)]

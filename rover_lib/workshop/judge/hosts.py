@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rover_lib.onboard.columns import number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.installed import SHIPPED
@@ -40,9 +41,7 @@ class Benchmarks:
         rows = []
         for host, b in self.by_host.items():
             m = b["metrics"]
-            heat, clock = m.get("temperature_c"), m.get("clock_mhz")
-            sensed = ("-" if heat is None else f"{heat:.1f}", "-" if clock is None else f"{clock:.0f}")
-            state = (*sensed, m.get("throttled") or "-")
+            state = (number(m.get("temperature_c")), number(m.get("clock_mhz"), ".0f"), m.get("throttled") or "-")
             for name, v in m["artifacts"].items():
                 times = [f"{v[f'latency_{p}_ms']:.1f}" for p in ("p50", "p95", "p99")]
                 if b is not self.by_host.get(THIS):  # on a rover the file in use is always called policy.pt

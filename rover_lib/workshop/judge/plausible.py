@@ -16,9 +16,9 @@ import numpy as np
 
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.judge.recorded_range import HELD_OFF, Range, constant_actions, hardly_varies, usual_size
+from rover_lib.workshop.judge.recorded_range import HELD_OFF, Range, hardly_varies
 from rover_lib.workshop.notebook_table import Table
-from rover_lib.workshop.recordings.samples import Sample, frame_rate_hz, is_another_rate, pick_evenly
+from rover_lib.workshop.recordings.samples import Sample, frame_rate_hz, is_another_rate, pick_evenly, stack_chunks
 
 FRAMES = 12  # planned in FP32, which takes ten seconds for a policy of full size
 BEYOND = 0.5  # a prediction lies beyond if it passes either end by this share of the range; a good policy does not
@@ -52,24 +52,25 @@ class Fit:
         """A table for people: the ranges of the recorded actions, and of the policy's actions on the same frames."""
         rows = []
         for name, fit in self.actions.items():
-            rows.append((name, *("{:.3g} to {:.3g}".format(*ends) for ends in (self.recorded[name], fit["predicted"]))))
+            ranges = (self.recorded[name], fit["predicted"])
+            rows.append((name, *(f"{low:.3g} to {high:.3g}" for low, high in ranges)))
         return Table(("", "recorded", "predicted"), rows)
 
     def warnings(self) -> list[str]:
         """A sentence for each number that does not fit."""
         warnings = []
         for name, fit in self.actions.items():
+            problem = ""
             if fit["beyond_pct"] > MOST_BEYOND_PCT:
                 problem = f"{fit['beyond_pct']:.0f} % of its predictions are far outside of what was recorded"
-                warnings.append(f"{name}: {problem}; {self.remedy}")
             elif fit["spread"] < LEAST_SPREAD and not fit["held"]:
                 problem = f"its predictions vary {100 * fit['spread']:.0f} % as much as what was recorded"
+            if problem:
                 warnings.append(f"{name}: {problem}; {self.remedy}")
         for name, largest in self.largest_state.items():
             if not largest <= LARGEST_STATE:
-                warnings.append(
-                    f"state {name}: the policy is told up to {largest:.3g} standard deviations; {self.remedy}"
-                )
+                problem = f"the policy is told up to {largest:.3g} standard deviations"
+                warnings.append(f"state {name}: {problem}; {self.remedy}")
         for episode, found_hz in list(self.other_rates_hz.items())[:1]:
             problem = f"the policy plans {self.plans_hz:g} steps a second, and {episode} has {found_hz:.1f} frames"
             warnings.append(f"{problem}: the car would drive at another speed than the human did")
@@ -89,21 +90,20 @@ def fits(checkpoint: Checkpoint, samples: Sequence[Sample], action_range: Mappin
     config = checkpoint.config
     tried = pick_evenly(samples, FRAMES)
     plans = predictions(ACT(config, checkpoint.weights), [inputs_of(s, config) for s in tried]).numpy()
-    present = ~np.stack([s.is_pad for s in tried])
-    recorded = np.stack([s.chunk for s in tried])
+    recorded, is_pad = stack_chunks(tried)
     actions = {}
     for i, (name, (low, high)) in enumerate(action_range.items()):
-        if name in constant_actions(action_range):
+        if not high > low:
             continue
         values = plans[..., i]
-        acted = recorded[..., i][present]
+        acted = recorded[..., i][~is_pad]
         constant = hardly_varies(name, acted)
-        margin = max(BEYOND * (high - low), HELD_OFF * usual_size(acted) if constant else 0)
+        margin = max(BEYOND * (high - low), HELD_OFF * float(np.abs(acted).mean()) if constant else 0)
         beyond = (values < low - margin) | (values > high + margin)
         actions[name] = {
             "predicted": [float(values.min()), float(values.max())],
             "beyond_pct": 100 * float(beyond.mean()),
-            "spread": float(values[present].std() / max(acted.std(), 1e-12)),
+            "spread": float(values[~is_pad].std() / max(acted.std(), 1e-12)),
             "held": constant,
         }
     largest: dict[str, float] = {}

@@ -32,7 +32,8 @@ def verdict(
     params: the content of params.yml. refusals: by mode, as `Expected.refusals`. "ready" in the result: whether the
     policy drives; "deploy" is None if no artifact of it should drive this car.
     """
-    limits, benchmark = params["verdict"], stages["benchmark"]
+    limits = params["verdict"]
+    benchmark = stages["benchmark"]
     rows = _rows(stages, params)
     failed = _list_failures(stages, params, names, rows)
     unfit = _list_unfit(stages, failed)
@@ -80,6 +81,7 @@ def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]
     for mode, metrics in all_found.items():
         time = timed.get(mode, {})
         gate_rows = [] if mode == "fp32" else gates(compared, params["gates"], mode)
+        missed = [r for r in gate_rows if r["passed"] is False and mode in r["gate"]]
         rows[mode] = {
             "mode": mode,
             "size_mb": metrics["size_mb"],
@@ -96,11 +98,7 @@ def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]
             "pairs": metrics.get("pairs"),
             "float_blocks": stages["quantize"]["modes"].get(mode, {}).get("float_blocks", []),
             "worlds_decide": any(r["gate"].endswith(WORLDS_LOST) and r["passed"] is not None for r in gate_rows),
-            "missed_gates": [
-                {**r, "words": gate_in_words(r["gate"])}
-                for r in gate_rows
-                if r["passed"] is False and mode in r["gate"]
-            ],
+            "missed_gates": [r | {"words": gate_in_words(r["gate"])} for r in missed],
         }
     static, mixed = rows.get("static"), rows.get("mixed")
     if static and mixed and static["time_ms"] and mixed["time_ms"] and mixed["time_ms"] < static["time_ms"]:
@@ -134,8 +132,7 @@ def _work_key(rows: Sequence[Mapping[str, Any]]) -> str | None:
 
 def time_key(benchmark: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
     """Return which time of a mode is compared: the median, or the smallest if the machine was busy."""
-    has_minimum = all("latency_min_ms" in timed for timed in benchmark["artifacts"].values())
-    return "latency_min_ms" if has_minimum and _busy(benchmark, limits) else "latency_p50_ms"
+    return "latency_min_ms" if _busy(benchmark, limits) else "latency_p50_ms"
 
 
 def _busy(benchmark: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
@@ -171,7 +168,7 @@ def _list_failures(
 def _list_unfit(stages: Stages, failed: Sequence[Mapping[str, Any]]) -> list[str]:
     """Say why no artifact of this policy should drive a car, and what helps; empty if nothing speaks against it."""
     compared = stages["compare"]
-    looking = stages["compare"].get("looking", {})
+    looking = compared.get("looking", {})
     guesses = compared.get("guesses", {})
     fit = stages["load"].get("fit", {}).get("warnings", [])
     constant = [action for action, guess in guesses.get("actions", {}).items() if guess["held"]]

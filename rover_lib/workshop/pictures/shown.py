@@ -20,7 +20,7 @@ from rover_lib.onboard.errors import EpisodeError
 from rover_lib.workshop.pictures.beside import LEAST_DRIVES, find_swapped, find_upside_down
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.faults import Faults
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, pick_evenly
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, by_camera, pick_evenly
 
 PLACES, LEAST_PLACES, MOST_DRIVES = 600, 6, 150  # looked at in all, and in a drive; drives
 ENCODED = 3  # a PNG's or a video's picture costs some times more than a JPEG's, whose small version is decoded
@@ -181,8 +181,7 @@ def _note_others(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> No
 
 
 def _scaled(sample: Sample, camera: str) -> np.ndarray:
-    frame: Any = sample.frame_bgr(SEEN[0])
-    frame = frame[camera] if isinstance(frame, dict) else frame
+    frame = by_camera(sample.frame_bgr(SEEN[0]), camera)[camera]
     return cv2.resize(frame, SEEN, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 import cv2
@@ -59,12 +59,9 @@ class Turning:
             return f"{self.episode}: steers too little to tell which way (spread {self.spread:.2f} of {LEAST_SPREAD})"
         if self.correlation is None:
             return f"{self.episode}: too few pictures that move to tell which way it steers"
-        figures = (
-            f"correlation {self.correlation:+.2f}, {self.sure:.1f} standard errors, steering spread {self.spread:.2f}"
-        )
-        return f"{self.episode}: " + (
-            f"positive steering is {self.side} ({figures})" if self.side else f"not sure ({figures})"
-        )
+        correlation = f"correlation {self.correlation:+.2f}, {self.sure:.1f} standard errors"
+        words = f"positive steering is {self.side}" if self.side else "not sure"
+        return f"{self.episode}: {words} ({correlation}, steering spread {self.spread:.2f})"
 
 
 @dataclass(frozen=True)
@@ -89,8 +86,8 @@ class Sides:
         """The episodes whose pictures, or steering, are mirrored beside most of the others'."""
         if not self.side:
             return []
-        others = [t for t in self.turnings if t.side not in (None, self.side)]
-        return [piece for turning in others for piece in turning.pieces]
+        others = [t.pieces for t in self.turnings if t.side not in (None, self.side)]
+        return list(chain.from_iterable(others))
 
     @property
     def denied(self) -> bool:
@@ -122,7 +119,7 @@ def measure_sides(recordings: Recordings, progress: Progress = silent, most: int
     # OpenCV releases the interpreter's lock, so threads help.
     with ThreadPoolExecutor(min(16, os.cpu_count() or 1)) as pool:
         turnings = tuple(progress(pool.map(measure_turning, drives), desc="which way it steers", total=len(drives)))
-    sides = {e.samples[0].car.positive for drive in drives for e in drive}
+    sides = {e.samples[0].car.positive for e in chain.from_iterable(drives)}
     # A LeRobotDataset, which states its rate, has no car's file.
     return Sides(turnings, sides.pop() if len(sides) == 1 and layout.rate_hz is None else None)
 
@@ -137,7 +134,7 @@ def measure_turning(drive: Sequence[Episode]) -> Turning:
         budget -= len(pieces[-1])
         if budget < STEP * LEAST_PAIRS:
             break
-    steering = np.array([s.chunk[0, 0] for samples in pieces for s in samples], float)
+    steering = np.array([s.chunk[0, 0] for s in chain.from_iterable(pieces)], float)
     names = tuple(e.id for e in drive)
     best = Turning(drive[0].session or names[0], None, 0.0, float(steering.std()), names)
     if best.spread < LEAST_SPREAD / 2:

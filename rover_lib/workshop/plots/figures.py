@@ -14,19 +14,21 @@ from rover_lib.workshop.recordings.episodes import Episode, Recordings, Split
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
 
 AHEAD = "step of the plan (s ahead)"
+PICTURES = 5  # of an episode
+MOST_EPISODES = 12
 
 
-def episode_overview(episode: Episode, actions: Sequence[str] = ACTION_NAMES, pictures: int = 5) -> Figure:
+def episode_overview(episode: Episode, actions: Sequence[str]) -> Figure:
     """Draw one episode: what the cameras saw, and what was done; for a car also the pulses that its servos got."""
     samples = episode.samples
-    shown = np.linspace(0, len(samples) - 1, pictures).round().astype(int)
+    shown = np.linspace(0, len(samples) - 1, PICTURES).round().astype(int)
     lines: dict[str, Any] = {name: [s.chunk[0, i] for s in samples] for i, name in enumerate(actions)}
     if tuple(actions) == ACTION_NAMES:
         pulses = np.array([s.pulses_us or list(vars(s.car.pwm.pulses(*s.chunk[0].tolist())).values()) for s in samples])
         computed = "" if samples[0].pulses_us else ",\ncomputed"
         lines |= {f"{name}\npulse (us{computed})": pulses[:, i] for i, name in enumerate(actions)}
     heights = (1.3, *[0.6] * len(lines))
-    fig, axes = new_figure(len(heights), pictures, height_in=2.0 + 0.9 * len(lines), height_ratios=heights)
+    fig, axes = new_figure(len(heights), PICTURES, height_in=2.0 + 0.9 * len(lines), height_ratios=heights)
     for ax, i in zip(axes[0], shown, strict=True):
         style.show_picture(ax, samples[i], f"{samples[i].time_s:.1f} s")
     grid = axes[0, 0].get_gridspec()
@@ -43,10 +45,10 @@ def episode_overview(episode: Episode, actions: Sequence[str] = ACTION_NAMES, pi
     return fig
 
 
-def used_frames(recordings: Recordings, parts: Split, most: int = 12) -> Figure:
+def used_frames(recordings: Recordings, parts: Split) -> Figure:
     """Draw for each episode when its pictures could be used, and when not, with the share that was left out.
 
-    Those episodes are drawn of which most was left out, `most` at most. Colours tell what each part is for.
+    Those episodes are drawn of which most was left out, MOST_EPISODES at most. Colours tell what each part is for.
     """
     rows = []
     for episode in recordings.episodes:
@@ -54,16 +56,18 @@ def used_frames(recordings: Recordings, parts: Split, most: int = 12) -> Figure:
         left_out_s = max(episode.duration_s + step_s - sum(width for _, width in spans), 0.0)
         rows.append((left_out_s / (episode.duration_s + step_s), episode, spans, step_s))
     rows.sort(key=lambda row: (-round(row[0], 3), row[1].id))
-    part_of = {episode: part for part, ids in parts.episodes.items() for episode in ids}
+    part_of: dict[str, str] = {}
+    for part, ids in parts.episodes.items():
+        part_of |= dict.fromkeys(ids, part)
     colours = dict(zip(parts.episodes, (style.MIST, style.OTHERS[1], style.SLATE), strict=False))
-    shown = rows[:most]
+    shown = rows[:MOST_EPISODES]
     fig, axes = new_figure(1, height_in=1.6 + 0.26 * len(shown))
     ax = axes[0, 0]
     for y, (share, episode, spans, step_s) in enumerate(shown):
         ax.barh(y, episode.duration_s + step_s, 0.7, color=style.RED)
         ax.broken_barh(spans, (y - 0.35, 0.7), color=colours.get(part_of.get(episode.id, ""), style.GREY))
-        said = f" {100 * share:.1f} % left out" if round(share, 3) else " all used"
-        ax.text(episode.duration_s + step_s, y, said, va="center", fontsize=9)
+        label = f" {100 * share:.1f} % left out" if round(share, 3) else " all used"
+        ax.text(episode.duration_s + step_s, y, label, va="center", fontsize=9)
     for part, colour in (*colours.items(), ("left out", style.RED)):
         ax.bar(0, 0, color=colour, label=part.replace("_", " "))
     ax.set_yticks(range(len(shown)), [episode.id for _, episode, *_ in shown])
@@ -91,10 +95,12 @@ def sensitivity(table: Mapping[str, Mapping[str, float | None]]) -> Figure:
     fig, axes = new_figure(1, height_in=1.2 + 0.26 * len(table))
     ax = axes[0, 0]
     first = next(iter(table.values()))
-    every = [key for key in first if key.endswith("_mae_pct")]
-    keys = [key for key in every if first[key] is not None]
-    for key in (key for key in every if key not in keys):
-        ax.plot([], [], " ", label=f"{key.removesuffix('_mae_pct')}: not judged")
+    keys = []
+    for key, value in first.items():
+        if key.endswith("_mae_pct") and value is None:
+            ax.plot([], [], " ", label=f"{key.removesuffix('_mae_pct')}: not judged")
+        elif key.endswith("_mae_pct"):
+            keys.append(key)
     bars = {key.removesuffix("_mae_pct"): [row[key] for row in table.values()] for key in keys}
     if len(keys) > MOST_ACTIONS:
         bars = {f"the worst of {len(keys)} actions": [worst(row[key] for key in keys) for row in table.values()]}
@@ -111,11 +117,11 @@ def sensitivity(table: Mapping[str, Mapping[str, float | None]]) -> Figure:
 
 def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure | Note:
     """Draw each mode's mean error against FP32 at each step of the plan, in % of the recorded range."""
-    actions, steps = report.action_names, report.reference.shape[1]
+    actions = report.action_names
     if all(report.pct(action) is None for action in actions):
         return Note("no action changes in these recordings: nothing is judged")
     fig, fields = style.figure_of(len(actions), min(max(len(actions), 2), MOST_ACTIONS), 3.6)
-    times_s = np.arange(steps) / rate_hz
+    times_s = np.arange(report.reference.shape[1]) / rate_hz
     for i, (ax, action) in enumerate(zip(fields, actions, strict=True)):
         ax.set_title(action)
         if report.pct(action) is None:
@@ -130,19 +136,20 @@ def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure | Note:
     return fig
 
 
-def action_against(report: Fidelity, mode: str = "static") -> Figure | Note:
-    """Draw a mode's actions against FP32's on the same frames, whole plans, for each action that is judged."""
+def action_against(report: Fidelity) -> Figure | Note:
+    """Draw static INT8's actions against FP32's on the same frames, whole plans, for each action that is judged."""
     actions = [action for action in report.action_names if report.pct(action) is not None][:MOST_ACTIONS]
     if not actions:
         return Note("no action changes in these recordings: nothing is compared")
     fig, fields = style.figure_of(len(actions), MOST_ACTIONS, 3.8)
     for ax, action in zip(fields, actions, strict=True):
         i = report.action_names.index(action)
-        exact, rounded = report.reference[..., i].ravel(), report.chunks[mode][..., i].ravel()
+        exact = report.reference[..., i].ravel()
+        rounded = report.chunks["static"][..., i].ravel()
         ends = [min(exact.min(), rounded.min()), max(exact.max(), rounded.max())]
         ax.plot(ends, ends, color=GREY, lw=1)
-        ax.plot(exact, rounded, ".", ms=3, color=style.COLOURS[mode], alpha=0.4, rasterized=True)
-        ax.set(xlabel=f"{action} of FP32", ylabel=f"{action} of {mode}", aspect="equal")
+        ax.plot(exact, rounded, ".", ms=3, color=style.COLOURS["static"], alpha=0.4, rasterized=True)
+        ax.set(xlabel=f"{action} of FP32", ylabel=f"{action} of static", aspect="equal")
         ax.set_title(f"r = {np.corrcoef(exact, rounded)[0, 1]:.5f}")
     return fig
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from rover_lib.onboard.car.host import throttled_means
@@ -35,7 +36,7 @@ def minutes(by_host: Mapping[str, Mapping[str, Any]], modes: Mapping[str, str]) 
             values = [span[key] for span in over_time]
             if all(value is None for value in values):
                 ax.text(0.5, 0.5, "not reported", ha="center", va="center", transform=ax.transAxes, fontsize=9)
-            ax.plot(times_min, [float("nan") if value is None else value for value in values], color=SLATE, lw=1.5)
+            ax.plot(times_min, np.array(values, float), color=SLATE, lw=1.5)  # None becomes NaN
         fall = clock_fall(over_time)
         for ax, label in zip(row, ("ms", "clock (MHz)", "temperature (C)"), strict=True):
             ax.set(xlabel="minutes", ylabel=label)

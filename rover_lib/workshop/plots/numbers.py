@@ -84,7 +84,7 @@ def bytes_by_part(modules: Mapping[str, nn.Module]) -> Figure:
         left += size_mb
     for row, total_mb in enumerate(left):
         ax.text(total_mb, row, f" {total_mb:.1f} MB", va="center", fontsize=9)
-    ax.set_yticks(range(len(modules)), ["FP32" if mode == "fp32" else mode for mode in modules])
+    ax.set_yticks(range(len(modules)), [style.line_of(mode)["label"] for mode in modules])
     ax.invert_yaxis()
     ax.set(xlabel="weights (MB, 10^6 bytes)", xlim=(0, 1.12 * left.max()))
     legend_below(fig, ax, 4)

@@ -10,7 +10,6 @@ rover.mplstyle has their sizes and lines.
 
 import io
 from base64 import b64encode
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from rover_lib.workshop.recordings.samples import by_camera
 
 WIDTH_IN, DPI, SHARPER = 9.0, 100, 2
 STYLE = Path(__file__).with_name("rover.mplstyle")
@@ -83,10 +84,9 @@ def figure_of(count: int, columns: int, row_in: float) -> tuple[Figure, list[Any
 
 def show_picture(ax: Axes, sample: Any, title: str = "") -> None:
     """Draw what a sample saw, the pictures of several cameras side by side, without axes."""
-    seen = sample.frame_bgr()
-    frames = list(seen.values()) if isinstance(seen, Mapping) else [seen]
+    frames = by_camera(sample.frame_bgr(), "").values()
     height = max(len(frame) for frame in frames)
-    same = [cv2.resize(f, (round(f.shape[1] * height / len(f)), height)) if len(f) != height else f for f in frames]
+    same = [cv2.resize(frame, (round(frame.shape[1] * height / len(frame)), height)) for frame in frames]
     ax.imshow(np.concatenate(same, axis=1)[..., ::-1])
     ax.set_title(title, fontsize=9)
     ax.axis("off")

@@ -1,5 +1,6 @@
 """Gates as tables for notebooks, and a benchmark held to what was promised."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,10 +17,11 @@ def gates(rows: Sequence[Mapping[str, Any]]) -> Table:
 
     rows: from `compare.gate` or `check_gates`.
     """
-    kept, missed, unknown = (sum(row["passed"] is passed for row in rows) for passed in (True, False, None))
-    caption = f"{kept} of {len(rows)} promises kept"
-    caption += f", {missed} missed" if missed else ""
-    caption += f", {unknown} not shown" if unknown else ""
+    counts = Counter(row["passed"] for row in rows)
+    caption = f"{counts[True]} of {len(rows)} promises kept"
+    for passed, words in ((False, "missed"), (None, "not shown")):
+        if counts[passed]:
+            caption += f", {counts[passed]} {words}"
     cells = [(gate_in_words(row["gate"]), _limit(row), _shown(row["found"]), KEPT[row["passed"]]) for row in rows]
     return Table(("gate", "promised", "found", "verdict"), tuple(cells), caption)
 
@@ -49,7 +51,9 @@ def _passes(gate: str, value: Any, limit: Any) -> bool:
 
 
 def _shown(value: Any) -> str:
-    return "-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+    if value is None:
+        return "-"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def _limit(row: Mapping[str, Any]) -> str:

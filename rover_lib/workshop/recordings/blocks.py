@@ -7,11 +7,10 @@ of one plan, so that no part has another's actions. What all blocks share is the
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import groupby
 
 import numpy as np
 
-from rover_lib.workshop.recordings.samples import Episode, Sample, block_of, frame_rate_hz
+from rover_lib.workshop.recordings.samples import Episode, Sample, frame_rate_hz
 
 BLOCK_S, SHORTER_S = 30.0, 20.0  # seconds; the shorter where there would be fewer than
 WANTED = 32  # blocks, a quarter of which are eight that are held out
@@ -79,7 +78,9 @@ def draw_blocks(places: Sequence[Sequence[str]], share: float, rng: np.random.Ge
 
 def part_by_blocks(episodes: Sequence[Episode], drawn: Mapping[str, str]) -> dict[str, tuple[Sample, ...]]:
     """Return the samples of each part, without those of the gaps. drawn: what draw_blocks returned."""
-    pairs = [(e, s) for e in episodes for s in e.samples]
+    pairs: list[tuple[Episode, Sample]] = []
+    for episode in episodes:
+        pairs += [(episode, sample) for sample in episode.samples]
     ranks = np.array([PARTS.index(drawn.get(s.block, PARTS[0])) for _, s in pairs])
     usable = np.ones(len(pairs), bool)
     chunk = len(pairs[0][1].chunk)
@@ -99,8 +100,3 @@ def part_by_blocks(episodes: Sequence[Episode], drawn: Mapping[str, str]) -> dic
                 usable[i] &= ranks[i] >= ranks[border]
                 i += step
     return {part: tuple(pairs[i][1] for i in np.flatnonzero(usable & (ranks == k))) for k, part in enumerate(PARTS)}
-
-
-def group_by_block(samples: Sequence[Sample]) -> list[list[int]]:
-    """Return the numbers of the samples of each block, in order: blocks are alike within, and are drawn as a whole."""
-    return [list(rows) for _, rows in groupby(range(len(samples)), key=lambda row: block_of(samples[row]))]

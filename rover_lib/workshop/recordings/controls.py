@@ -7,7 +7,7 @@ older one. The duty is the pulse's share of its period.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import TypeVar
 
@@ -52,7 +52,7 @@ def _formula(channel: Channel) -> str:
 
 def note_one_sided(episodes: Sequence[Episode], faults: Faults) -> None:
     """Add a fault if steering looks as if it were 0.5 straight ahead, as from 0 to 1 in some cars' files."""
-    steering = np.array([sample.chunk[0, 0] for episode in episodes for sample in episode.samples])
+    steering = np.array([s.chunk[0, 0] for s in chain.from_iterable(e.samples for e in episodes)])
     low, middle, high = np.quantile(steering, (0, 0.5, 1))
     if 0 <= low < HALF[0] <= middle <= HALF[1] < high:
         note = f"from {low:.2f} to {high:.2f}, half of it below {middle:.2f}: 0 must be straight ahead, is 0.5 here?"

@@ -10,13 +10,11 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from itertools import chain
-from typing import Any
 
 import cv2
 import numpy as np
 
-from rover_lib.workshop.recordings.faults import Faults
-from rover_lib.workshop.recordings.samples import Episode, Sample, pick_evenly
+from rover_lib.workshop.recordings.samples import Episode, Sample, by_camera, pick_evenly
 
 RUN = 4  # consecutive actions that are compared at once
 STEPS = (1, 2, 3, 4, 5)  # a copy may have only every fifth row
@@ -30,32 +28,29 @@ CORRELATED = 0.98  # or so similar, whatever their brightness: a car that moved 
 MOST_ALIKE = 50  # episodes with the same run; it then tells nothing
 
 
-def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episode, ...]:
-    """Return the episodes without those that are the same drive as another, of which the longest is kept."""
+def find_copies(episodes: Sequence[Episode]) -> list[tuple[Episode, Episode]]:
+    """Return each episode that is the same drive as another, at least as long one, with that one."""
     scaled = lru_cache(1000)(scaled_down)
     having: defaultdict[bytes, list[tuple[int, int]]] = defaultdict(list)
-    unique = set()
+    copies = []
     for i in sorted(range(len(episodes)), key=lambda i: (-len(episodes[i].samples), i)):
         runs = _runs(episodes[i])
         shared: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)
         for run, k in runs.items():
             for other, there in having[run]:
                 shared[other].append((k, there))
-        suspects = [
-            (episodes[other], pairs)
-            for other, pairs in shared.items()
-            if len(pairs) >= SHARED * len(runs) and not _follow(episodes[i], episodes[other])
-        ]
+        suspects = []
+        for other, pairs in shared.items():
+            if len(pairs) >= SHARED * len(runs) and not _follow(episodes[i], episodes[other]):
+                suspects.append((episodes[other], pairs))
         same = next((other for other, pairs in suspects if look_alike(episodes[i], other, pairs, scaled)), None)
         if same is not None:
-            note = f"the same drive as {same.id}, as its actions and pictures show"
-            faults.add(episodes[i].place, "copy", note)
+            copies.append((episodes[i], same))
             continue
-        unique.add(i)
         for run, k in chain.from_iterable(_runs(episodes[i], step).items() for step in STEPS):
             if len(having[run]) < MOST_ALIKE:
                 having[run].append((i, k))
-    return tuple(episode for i, episode in enumerate(episodes) if i in unique)
+    return copies
 
 
 def _runs(episode: Episode, step: int = 1) -> dict[bytes, int]:
@@ -76,9 +71,8 @@ def _runs(episode: Episode, step: int = 1) -> dict[bytes, int]:
 def _follow(episode: Episode, other: Episode) -> bool:
     """Whether they are pieces of one session, one after the other."""
     first, second = sorted((episode, other), key=lambda e: e.begin_s)
-    return (
-        episode.session != "" and episode.session == other.session and first.begin_s + first.duration_s < second.begin_s
-    )
+    together = episode.session != "" and episode.session == other.session
+    return together and first.begin_s + first.duration_s < second.begin_s
 
 
 def look_alike(
@@ -108,6 +102,5 @@ def _is_same(a: np.ndarray, b: np.ndarray) -> bool:
 
 def scaled_down(sample: Sample) -> np.ndarray:
     """The picture in few pixels; of several cameras, one beside the other."""
-    frame: Any = sample.frame_bgr(SEEN[0])
-    frames = frame.values() if isinstance(frame, dict) else (frame,)
+    frames = by_camera(sample.frame_bgr(SEEN[0]), "").values()
     return np.stack([cv2.resize(f, SEEN, interpolation=cv2.INTER_AREA).astype(np.float32) for f in frames])

@@ -16,7 +16,7 @@ import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -107,11 +107,8 @@ def load_recordings(
     if "dataset" not in kinds:
         for option, names in (("--action-names", source.action_names), ("--camera", source.cameras)):
             if names not in ((), ACTION_NAMES):
-                problem, names_in_words = (
-                    f"{root}: our recordings and tubs have one camera and named actions",
-                    ",".join(names),
-                )
-                raise EpisodeError(problem, found=f"{option} {names_in_words}", remedy="leave it out")
+                problem = f"{root}: our recordings and tubs have one camera and named actions"
+                raise EpisodeError(problem, found=f"{option} {','.join(names)}", remedy="leave it out")
         if tubs := find_tubs(root, kinds):
             return load_tubs(source, tubs, chunk, progress)
     if source.throttle:
@@ -325,7 +322,7 @@ def split(recordings: Recordings, held_out_share: float = 0.25, seed: int = 0) -
     note = f"only {len(episodes)} episodes: {count} of them are held out, not {held_out_share:.0%}" if far else None
 
     def samples_of(drawn: list[int]) -> Samples:
-        return tuple(s for i in sorted(drawn) for s in episodes[i].samples)
+        return tuple(chain.from_iterable(episodes[i].samples for i in sorted(drawn)))
 
     half = count // 2
     return Split(samples_of(order[count:]), samples_of(order[:half]), samples_of(order[half:count]), note)

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +92,8 @@ class _Camera:
         if self.rows is None:
             for row in {path: row for row, path in enumerate(self.paths)}.values():
                 with _as_episode_error(f"{self.paths[row]}: cannot be decoded"):
-                    self.read_bgr(row) if row not in self.torn else None
+                    if row not in self.torn:
+                        self.read_bgr(row)
             if self.torn:
                 note = f"the picture of '{self.key}' in row {min(self.torn)} is torn, or one it needs: copy it again"
                 faults.add(self.paths[min(self.torn)], "broken_picture", note, len(self.torn))
@@ -156,7 +157,7 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     import lerobot.utils.utils  # noqa: F401  # torch, which it imports, takes more memory than a table may
 
     dataset = _Dataset(source)
-    faults, layout = dataset.faults, dataset.layout
+    faults = dataset.faults
     with _as_episode_error(f"{dataset.root}: cannot be read"):
         with limited_memory():
             files = dataset.read_meta()
@@ -166,10 +167,10 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     episodes = [episode for row in listed if (episode := dataset.episode(row, chunk)).samples]
     if not episodes:
         raise faults.nothing_usable("no usable sample", WRITE_ANEW)
-    if layout.action_names == CHANNELS:
+    if dataset.layout.action_names == CHANNELS:
         note_one_sided(episodes, faults)
     own, blocks = name_long_drives(leave_out_copies(episodes, faults))
-    return Recordings(dataset.root, own, faults.listed(), source, layout, blocks, "dataset")
+    return Recordings(dataset.root, own, faults.listed(), source, dataset.layout, blocks, "dataset")
 
 
 class _Dataset:
@@ -180,9 +181,11 @@ class _Dataset:
     """
 
     def __init__(self, source: Source):
-        self.root, self.faults = source.path, Faults(source.path)
+        self.root = source.path
+        self.faults = Faults(self.root)
         self.info = _read_info(self.root)
-        self.features, self.fps = self.info["features"], float(self.info["fps"])
+        self.features = self.info["features"]
+        self.fps = float(self.info["fps"])
         self.layout, self.keys = _layout(self.root, self.info, source)
         self.columns: dict[str, np.ndarray] = {}
 
@@ -195,7 +198,9 @@ class _Dataset:
             tables = sorted(path for path in self.root.glob("meta/episodes/[!.]*/*") if OURS.fullmatch(path.name))
             if not tables:
                 raise _broken(f"{self.root}: has no meta/episodes/*/*.parquet")
-            rows = [row for path in tables for row in _read_table(self.root, path, "(?!stats/).*").to_pylist()]
+            rows = []
+            for path in tables:
+                rows += _read_table(self.root, path, "(?!stats/).*").to_pylist()
         self.entries = sorted(rows, key=lambda row: row["episode_index"])
         return list(dict.fromkeys(map(self._file, self.entries)))
 
@@ -236,7 +241,7 @@ class _Dataset:
         self.drivers = {row["episode_index"]: driver for row, driver in zip(self.entries, drivers, strict=True)}
         self._check_numbers()
         self.cameras = {name: self._camera(key, self.layout.image_sizes[name]) for name, key in self.keys.items()}
-        self.unusable = {row for camera in self.cameras.values() for row in camera.find_unusable(self.faults)}
+        self.unusable = set().union(*(camera.find_unusable(self.faults) for camera in self.cameras.values()))
 
     def _check_order(self) -> None:
         """Raise EpisodeError for rows that are not the frames of meta/ in their order, each once; note other counts."""
@@ -308,7 +313,9 @@ class _Dataset:
         from datasets import Dataset, Features, Image
         from lerobot.utils.utils import SuppressProgressBars
 
-        paths = [path for row in self.entries for path in [self._file(row)] * row["length"]]
+        paths: list[Path] = []
+        for row in self.entries:
+            paths += [self._file(row)] * row["length"]
         with SuppressProgressBars():
             undecoded = Features({key: Image(decode=False)})
             rows = Dataset.from_parquet([str(path) for path in dict.fromkeys(paths)], columns=[key], features=undecoded)
@@ -316,7 +323,9 @@ class _Dataset:
 
     def _video_camera(self, key: str, size: tuple[int, int]) -> _Camera:
         """Find each row's picture in a video. Raises EpisodeError for times at which a video shows none."""
-        parts = [part for row in self.entries for part in [(*self._shown(row, key), row)] * row["length"]]
+        parts: list[tuple[Path, float, float, Mapping[str, Any]]] = []
+        for row in self.entries:
+            parts += [(*self._shown(row, key), row)] * row["length"]
         times_s = np.array([first_s for _, first_s, *_ in parts]) + self.columns["timestamp"]
         torn = np.zeros(len(parts), bool)
         for path in dict.fromkeys(path for path, *_ in parts):
@@ -416,7 +425,7 @@ def _read_info(root: Path) -> dict[str, Any]:
     fps = info.get("fps")
     try:
         shapes = [feature.get("shape") or () for feature in features.values()]
-        right = all(is_whole(n, 1, 10_000) for shape in shapes for n in shape)
+        right = all(is_whole(n, 1, 10_000) for n in chain.from_iterable(shapes))
         right = right and 0 < len(features) <= MOST_FEATURES and isinstance(info.get("data_path"), str)
     except (AttributeError, TypeError, KeyError):
         right = False

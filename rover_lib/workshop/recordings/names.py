@@ -5,6 +5,7 @@ Names of actions are the car's own, other people's words for the same, or anothe
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ def flat_names(names: Any, depth: int = 4) -> tuple[str, ...]:
     if all(isinstance(part, str) for part in parts):
         return () if isinstance(names, Mapping) else tuple(parts)
     flat = [flat_names(part, depth - 1) for part in parts]  # {"motors": [...]}, [["throttle", "steering"]]
-    return tuple(name for part in flat for name in part) if all(flat) else ()
+    return tuple(chain.from_iterable(flat)) if all(flat) else ()
 
 
 def read_as_car(names: Sequence[str]) -> tuple[str, ...] | None:

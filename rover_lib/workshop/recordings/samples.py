@@ -51,8 +51,10 @@ class Layout:
             return ", ".join(f"{n} (column {i})" if swapped else n for n, i in zip(names, order, strict=True))
 
         rate = f", {self.rate_hz:g} frames a second" if self.rate_hz else ""
-        state, action = columns(self.state_names, self.state_order), columns(self.action_names, self.action_order)
-        state = state if self.has_state else f"none recorded, taken as the last action, {state}"
+        action = columns(self.action_names, self.action_order)
+        state = columns(self.state_names, self.state_order)
+        if not self.has_state:
+            state = f"none recorded, taken as the last action, {state}"
         cameras = f"camera{'s' if len(self.cameras) > 1 else ''}: {', '.join(self.cameras)}"
         return f"{cameras}; state: {state}; action: {action}{rate}"
 
@@ -93,14 +95,16 @@ class Sample:
         try:
             return self.turned(read_jpeg(self.frame_path, least))
         except OSError as e:
-            problem = f"cannot be read ({e.strerror})"
-            actual = None
-            remedy = "restore it or load again"
+            problem = f"{self.frame_path}: cannot be read ({e.strerror})"
+            raise EpisodeError(problem, remedy="restore it or load again") from None
         except CameraError as e:
-            problem = e.what
-            actual = e.found
             remedy = "delete it or record the episode again"
-        raise EpisodeError(f"{self.frame_path}: {problem}", found=actual, remedy=remedy)
+            raise EpisodeError(f"{self.frame_path}: {e.what}", found=e.found, remedy=remedy) from None
+
+
+def by_camera(frame: Any, name: str) -> Mapping[str, np.ndarray]:
+    """Return pictures by their cameras' names. frame: such pictures, or that of the only camera, called `name`."""
+    return frame if isinstance(frame, Mapping) else {name: frame}
 
 
 def block_of(sample: Any) -> str:
@@ -204,7 +208,8 @@ class Recordings:
         changed = [e for e in self.episodes if e.formulas]
         if not changed:
             return ""
-        formulas = ", ".join(sorted({f"{name} = {formula}" for e in changed for name, formula in e.formulas.items()}))
+        pairs = chain.from_iterable(e.formulas.items() for e in changed)
+        formulas = ", ".join(sorted({f"{name} = {formula}" for name, formula in pairs}))
         count = f"{len(changed)} of {len(self.episodes)} episodes"
         return f"the actions of {count} were recomputed from their pulses, as they follow another formula: {formulas}"
 
@@ -221,7 +226,11 @@ class Recordings:
         for fault in self.faults:
             if re.fullmatch(f"{SHOW_NOTHING}|other_state", fault.kind):
                 by_kind.setdefault(fault.kind, []).append(fault)
-        return [f"{f[0].file}{f' and {len(f) - 1} more' if f[1:] else ''}: {f[0].note}" for f in by_kind.values()]
+        sentences = []
+        for first, *others in by_kind.values():
+            more = f" and {len(others)} more" if others else ""
+            sentences.append(f"{first.file}{more}: {first.note}")
+        return sentences
 
     def hashes(self) -> dict[str, str]:
         """SHA-256 of every file of the samples, by its path relative to `root`. Raises EpisodeError if one is gone."""
@@ -265,6 +274,11 @@ def following(actions: np.ndarray, chunk: int) -> tuple[np.ndarray, np.ndarray]:
     n = len(actions)
     index = np.arange(n)[:, None] + np.arange(chunk)
     return actions[np.minimum(index, n - 1)], index >= n
+
+
+def stack_chunks(samples: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Return what was done at n samples, (n, C, A), and which of its steps are padding, (n, C) bool."""
+    return np.stack([s.chunk for s in samples]), np.stack([s.is_pad for s in samples])
 
 
 def pick_evenly(samples: Sequence[Any], at_most: int) -> tuple[Any, ...]:

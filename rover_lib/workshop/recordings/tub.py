@@ -10,7 +10,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import chain, pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -90,9 +90,10 @@ def find_tubs(root: Path, kinds: Sequence[str], deepest: int = DEEPEST) -> list[
     if kinds or not deepest or not root.is_dir():
         return []
     folders = [p for p in root.iterdir() if p.is_dir() and not p.name.startswith((".", "__MACOSX"))][:MOST_FOLDERS]
-    if any((folder / name).exists() for folder in folders for name in EPISODE_FILES):
+    if any((folder / name).exists() for folder, name in product(folders, EPISODE_FILES)):
         return []
-    return [tub for folder in sorted(folders) for tub in find_tubs(folder, kinds_of(folder), deepest - 1)]
+    inside = (find_tubs(folder, kinds_of(folder), deepest - 1) for folder in sorted(folders))
+    return list(chain.from_iterable(inside))
 
 
 def load_tubs(source: Source, tubs: Sequence[Path], chunk: int, progress: Progress = silent) -> Recordings:
@@ -119,7 +120,7 @@ def load_tubs(source: Source, tubs: Sequence[Path], chunk: int, progress: Progre
             all_faults.counted |= faults.counted
     if not parts:
         raise all_faults.nothing_usable(f"none of its {len(tubs)} tubs can be used", COPY)
-    whole = [episode for _, own in parts for episode in own]
+    whole = list(chain.from_iterable(own for _, own in parts))
     note_one_sided(whole, all_faults)
     unique = set(map(id, leave_out_copies(whole, all_faults)))
     episodes = list[Episode]()
@@ -128,7 +129,8 @@ def load_tubs(source: Source, tubs: Sequence[Path], chunk: int, progress: Progre
         if unique_here := [e for e in own if id(e) in unique]:
             named, names = name_blocks(unique_here, place)
             episodes += named
-            blocks += [names] if names else []
+            if names:
+                blocks.append(names)
     return Recordings(root, tuple(episodes), all_faults.listed(), source, blocks=tuple(blocks), kind="tub")
 
 
@@ -163,9 +165,8 @@ class _Tub:
             first = records[run[0]]
             session = "/".join(filter(None, (self.place, first.session or "session")))
             began_s.setdefault(session, first.time_s)
-            samples = self._samples(
-                f"{session} from {first.index}", [(records[i], pictures[i]) for i in run], stands, chunk
-            )
+            part = [(records[i], pictures[i]) for i in run]
+            samples = self._samples(f"{session} from {first.index}", part, stands, chunk)
             found_hz = frame_rate_hz(samples)
             if len(samples) >= LEAST_RATED and is_another_rate(found_hz, 1 / usual_s):
                 note = f"{found_hz:.1f} Hz from record {first.index} on"
@@ -231,30 +232,32 @@ class _Tub:
 
     def _records(self, catalogs: Iterable[str], deleted: set[int]) -> Iterator["_Record"]:
         """Yield the records that count."""
-        tub, faults = self.path, self.faults
+        faults = self.faults
         for name in dict.fromkeys(catalogs):  # each once
-            if Path(name).name != name or not (tub / name).is_file():
-                faults.add(tub, "catalog_missing", f"{quote(name)} is in the manifest, and no file of the tub")
+            if Path(name).name != name or not (self.path / name).is_file():
+                faults.add(self.path, "catalog_missing", f"{quote(name)} is in the manifest, and no file of the tub")
                 continue
-            lines = _read(tub / name).splitlines()
+            lines = _read(self.path / name).splitlines()
             if len(lines) > MOST_LINES:
-                faults.add(tub, "broken_record", f"{name}: at most {MOST_LINES} lines are read", len(lines))
+                faults.add(self.path, "broken_record", f"{name}: at most {MOST_LINES} lines are read", len(lines))
                 continue
             for number, line in enumerate(lines, 1):
                 place = f"{name}, line {number}"
                 try:
                     record = _parse(line)
                 except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as e:
-                    faults.add(tub, "broken_record", f"{place}: {quote(str(e))}")
+                    faults.add(self.path, "broken_record", f"{place}: {quote(str(e))}")
                     continue
                 self.began[record.session] = min(record.index, self.began.get(record.session, record.index))
                 if record.index in deleted:
-                    faults.add(tub, "deleted_record", f"{place}: its manifest calls record {record.index} deleted")
+                    faults.add(
+                        self.path, "deleted_record", f"{place}: its manifest calls record {record.index} deleted"
+                    )
                 elif record.driver != "user":
-                    faults.add(tub, "a_pilot_drove", f"{place}: {quote(record.driver)}")
+                    faults.add(self.path, "a_pilot_drove", f"{place}: {quote(record.driver)}")
                 else:
                     note = f"records without a time: taken as {RATE_HZ:g} a second"
-                    faults.add(tub, "no_times", note, not record.timed)
+                    faults.add(self.path, "no_times", note, not record.timed)
                     yield record
 
 

@@ -14,9 +14,8 @@ def run_folder(runs_dir: Path | str, name: str, error: type[RoverError]) -> Path
     file of that name.
     """
     if not re.fullmatch(r"\w[\w.-]*", name):
-        raise error(
-            "a run's name must be a plain folder name", found=repr(name), remedy="use letters, digits, _, - and ."
-        )
+        remedy = "use letters, digits, _, - and ."
+        raise error("a run's name must be a plain folder name", found=repr(name), remedy=remedy)
     folder = (Path(runs_dir) / name).resolve()
     if folder.exists() and not folder.is_dir():
         raise error(f"{folder}: is a file, and not a run's folder", remedy="give another --name")

@@ -47,8 +47,10 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
     if kind in ("recordings", "dataset", "tub") or (kind is None and path.is_dir()):
         recordings = with_faults(load_recordings(source, progress=progress), progress)
         sides = measure_sides(recordings, progress)
-        words = {"steering": sides.words(), "by_episode": [turning.words() for turning in sides.turnings]}
-        return {"recordings": recordings.summary() | (words if sides.turnings else {})}
+        content = recordings.summary()
+        if sides.turnings:
+            content |= {"steering": sides.words(), "by_episode": [turning.words() for turning in sides.turnings]}
+        return {"recordings": content}
     from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint  # it names other files, as for `rover run`
 
     checkpoint = load_checkpoint(path, said=source.facts)

@@ -72,9 +72,8 @@ def check_parameters(**turned: Any) -> None:
     if not passed and len(set(files.values())) > 1:
         default = next(name for name, of_default in files.items() if of_default)
         remedy = f"set {', '.join(files)}; if you mean the demo's, by its whole path"
-        raise ParamsError(
-            f"the parameter {default} is still the notebook's default", found=turned[default], remedy=remedy
-        )
+        problem = f"the parameter {default} is still the notebook's default"
+        raise ParamsError(problem, found=turned[default], remedy=remedy)
 
 
 def _is_of_a_run(value: Any) -> bool:

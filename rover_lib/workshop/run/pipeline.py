@@ -73,10 +73,11 @@ def make_artifact(
     Where there are odd frames, which one scale may not serve, the ranges are chosen first. Returns its content hash,
     and warnings. Raises ArtifactError.
     """
-    checkpoint, parts = loaded.checkpoint, loaded.parts
+    checkpoint = loaded.checkpoint
+    parts = loaded.parts
     samples = pick_evenly(parts.choosing or parts.calibration, EXPORT_FRAMES)
     settings = p["quantization"]
-    scheme = Scheme(smooth=p["quantization"]["smooth"])
+    scheme = Scheme(smooth=settings["smooth"])
     frames, note = choose_calibration(parts.calibration, p["calibration"]["samples"], p["calibration"]["seed"])
     calibration = calibrate(checkpoint, frames, smooth=scheme.smooth, progress=progress)
     if odd_share(calibration.frames):
@@ -100,15 +101,14 @@ def export_policies(
     drives: by which those that a rover may drive by (DRIVEN) tell how unfamiliar a picture is.
     """
     described = {}
-    for mode in {*ARTIFACTS, "static_affine"} - policies.keys():  # which older versions made
+    for mode in set(ARTIFACTS) - policies.keys():
         (Path(folder) / f"policy_{mode}.pt").unlink(missing_ok=True)
     exporter = Exporter(checkpoint, samples)
     for name, policy in policies.items():
         forget_graphs()
         path = Path(folder) / f"policy_{name}.pt"
-        known_drives = drives if name in DRIVEN else None
-        quantized = isinstance(policy, QuantizedPolicy)
-        digest, familiar = exporter.export(policy, path, calibration if quantized else None, known_drives)
+        own = calibration if isinstance(policy, QuantizedPolicy) else None
+        digest, familiar = exporter.export(policy, path, own, drives if name in DRIVEN else None)
         described[name] = {"content_hash": digest} | ({"familiar": familiar} if familiar else {})
         if isinstance(policy, QuantizedPolicy):
             described[name] |= policy.report | {"scheme": asdict(policy.scheme)}
@@ -124,7 +124,8 @@ def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, s
     """
     run_dir = Path(run_dir)
     again = open_run(run_dir, progress)
-    checkpoint, parts = again.checkpoint, again.parts
+    checkpoint = again.checkpoint
+    parts = again.parts
     exporter = Exporter(checkpoint, pick_evenly(parts.choosing or parts.calibration, EXPORT_FRAMES))
     stage = read_stage(run_dir / "quantize.json", "quantize")
     static = stage["metrics"]["modes"]["static"]

@@ -14,6 +14,7 @@ import shutil
 import socket
 import sys
 from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -75,7 +76,7 @@ def parameters_of(notebook: Path) -> set[str]:
 
 def parameters_in(notebook: Path) -> list[tuple[str, str, str]]:
     """Return (name, literal, comment) for each line of the notebook's `parameters` cell."""
-    return [(name, literal, comment) for name, literal, comment in LINE.findall(_parameters_cell(notebook)[1].source)]
+    return LINE.findall(_parameters_cell(notebook)[1].source)
 
 
 def _parameters_cell(notebook: Path) -> tuple[Any, Any]:
@@ -133,7 +134,7 @@ def files_of_a_run(folder: Path) -> list[Path]:
     stages = ("load", "calibrate", "quantize", "compare", "run", "arm", "parts", "drive", "students", "learn")
     names = [f"{stage}.json" for stage in (*stages, f"benchmark-{socket.gethostname()}")]
     names += [*(f"{n}.ipynb" for n in NAMES + AFTERWARDS), "figures", "hailo", "report.html"]
-    own = [folder / n for n in names] + [p for pattern in OWN_FILES for p in folder.glob(pattern)]
+    own = [*(folder / name for name in names), *chain.from_iterable(map(folder.glob, OWN_FILES))]
     return [path for path in own if path.exists()]
 
 
@@ -174,13 +175,8 @@ def _execute(source: Path, folder: Path, given: Mapping[str, Any], bars: bool) -
 
     logging.getLogger("papermill").setLevel(logging.ERROR)  # it says what it executes; the bar does that
     bar = {"leave": False} if bars and sys.stderr.isatty() else False  # of its cells
-    options: dict[str, Any] = {
-        "cwd": str(folder),
-        "progress_bar": bar,
-        "kernel_name": "python3",
-        "start_timeout": START_S,
-    }
-    options |= {"kernel_manager_class": ThisPython}
+    options: dict[str, Any] = {"cwd": str(folder), "progress_bar": bar, "start_timeout": START_S}
+    options |= {"kernel_name": "python3", "kernel_manager_class": ThisPython}
     with patch.dict(os.environ, KERNEL_ENVIRONMENT), atomic_path(folder / source.name) as temporary:
         try:
             papermill.execute_notebook(with_parameters(source, given), str(temporary), **options)

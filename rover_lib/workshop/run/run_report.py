@@ -5,6 +5,7 @@ print(text(content["metrics"]))
 """
 
 from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +97,7 @@ def text(judged: Mapping[str, Any]) -> str:
 
 def columns(judged: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """The modes beside each other, a header first: for a terminal and for a card. A dash where nothing was measured."""
-    actions = list(dict.fromkeys(action for row in judged["modes"] for action in row["errors_pct"]))
+    actions = list(dict.fromkeys(chain.from_iterable(row["errors_pct"] for row in judged["modes"])))
     instructions = ("10^9 instructions",) if any(row["instructions_g"] for row in judged["modes"]) else ()
     errors = (f"{action} error, %" for action in actions)
     lines = [("", "MB", "times smaller", *errors, "hits", judged["compared"], "times faster", *instructions)]
@@ -124,7 +125,8 @@ def write_card(run_dir: Path | str, **given: str | None) -> Path:
     recordings = load["recordings"]
     metadata = {key: given.get(key) or load["checkpoint"].get(key) for key in ("license", "base_model")}
     hub = {key: value for key, value in metadata.items() if value}
-    hub |= {"base_model_relation": "quantized"} if "base_model" in hub else {}
+    if "base_model" in hub:
+        hub["base_model_relation"] = "quantized"
     values = {"name": folder.resolve().name, "judged": result, "header": header, "rows": rows, "recordings": recordings}
     values["hub"] = yaml.safe_dump(hub) if hub else ""
     with atomic_path(path) as temporary:

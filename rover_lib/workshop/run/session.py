@@ -66,12 +66,10 @@ def open_run(run_dir: Path | str, progress: Progress = silent) -> Opened:
         torch.set_num_threads(1)
     again = load(parameters["checkpoint"], Source.loaded(parameters), progress, loaded["sha256"])
     now = again.checkpoint
-    then = stage["metrics"].get("recordings", {}).get("layout"), stage["metrics"]["split"]
-    words = again.recordings.layout.words()
-    # older runs lack an identity and a layout
-    if (now.sha256, now.identity) != (loaded["sha256"], loaded.get("identity", now.identity)):
+    then = stage["metrics"]["recordings"].get("layout"), stage["metrics"]["split"]
+    if (now.sha256, now.identity) != (loaded["sha256"], loaded["identity"]):
         problem = f"{now.path}: its weights, config or statistics have changed since notebook 01 loaded it"
-    elif (then[0] or words, then[1]) != (words, again.parts.episodes):
+    elif then != (again.recordings.layout.words(), again.parts.episodes):
         problem = f"{again.recordings.root}: other episodes, or another order of numbers, than notebook 01 loaded"
     else:
         return again

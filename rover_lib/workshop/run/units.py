@@ -6,6 +6,7 @@ readings of the recordings. If the files' fit better, its normalisation converts
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -29,7 +30,7 @@ def in_todays_units(policy: Checkpoint, recordings: Recordings, samples: Sequenc
     if policy.config.action_names != ACTION_NAMES or policy.config.state_names != ACTION_NAMES:
         return policy
     car = car_of(recordings.samples)
-    recorded = {n: OLD[n] for e in recordings.episodes for n in e.formulas}
+    recorded = {n: OLD[n] for n in chain.from_iterable(e.formulas for e in recordings.episodes)}
     # Throttle tells the two readings apart: standing still is 0 in one of them only.
     tried = [recorded] if recorded else []
     if car.drives_like(Car()) and recordings.layout.rate_hz is None and OLD not in tried:

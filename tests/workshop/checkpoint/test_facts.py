@@ -163,14 +163,6 @@ def test_a_forks_keys_are_asked_about(lerobots):
         load_checkpoint(lerobots)
 
 
-def test_a_policy_in_other_programs_wrappers_is_the_same(lerobots):
-    right, file = load_checkpoint(lerobots).weights, lerobots / "model.safetensors"
-    for wrapped in ("module.model.", "model._orig_mod.", ""):
-        save_file({wrapped + name: weight for name, weight in right.items()}, file)
-        found = load_checkpoint(lerobots).weights
-        assert all(torch.equal(found[name], weight) for name, weight in right.items())
-
-
 def test_processors_and_adapters_that_change_actions_are_refused(lerobots):
     unused = {"registry_name": "relative_actions_processor", "config": {"enabled": False}}
     edit(lerobots / "policy_preprocessor.json", lambda c: c["steps"].append(unused))
@@ -220,13 +212,8 @@ def test_an_older_torchs_file_is_refused_and_saved_again_it_is_read(tiny, tiny_p
 def test_the_network_is_found_under_any_prefix_and_twice_it_is_asked_about(lerobots):
     right, file = load_checkpoint(lerobots).weights, lerobots / "model.safetensors"
     same = {name: weight.clone() for name, weight in right.items()}
-    for prefix in (
-        "_orig_mod.module.",
-        "_orig_mod.policy.model.",
-        "ema_model.",
-        "actor.",
-        "a.b._fsdp_wrapped_module.c.",
-    ):
+    wrappers = ("", "module.model.", "model._orig_mod.", "_orig_mod.module.", "_orig_mod.policy.model.")
+    for prefix in (*wrappers, "ema_model.", "actor.", "a.b._fsdp_wrapped_module.c."):
         counted = {f"{prefix}{name}": weight for name, weight in right.items()} | {"n_averaged": torch.tensor(7)}
         save_file(counted, file)
         found = load_checkpoint(lerobots).weights
@@ -246,21 +233,13 @@ def test_the_network_is_found_under_any_prefix_and_twice_it_is_asked_about(lerob
 
 def test_averaged_weights_are_asked_about_in_any_form_and_beside(tiny, tiny_policy, lerobots, tmp_path):
     weights = list(tiny.weights.values())
-    for number, more in enumerate(
-        (
-            {"ema": weights},
-            {"ema": {"shadow_params": weights, "decay": 0.99}},
-            {"best_weights": tuple(weights)},
-            {"flat_params": torch.cat([weight.flatten() for weight in weights])},
-        )
-    ):
+    averages = [{"ema": weights}, {"ema": {"shadow_params": weights, "decay": 0.99}}, {"best_weights": tuple(weights)}]
+    averages.append({"flat_params": torch.cat([weight.flatten() for weight in weights])})
+    for number, more in enumerate(averages):
         path = says_more(tiny_policy, tmp_path / f"m{number}.pth", **more)
         assert "the weights that should drive" in remedied(path)
-    for name, words in (
-        ("norm_stats.json", "normalised"),
-        ("ema.safetensors", "should drive"),
-        ("model_swa.pt", "should"),
-    ):
+    files = {"norm_stats.json": "normalised", "ema.safetensors": "should drive", "model_swa.pt": "should"}
+    for name, words in files.items():
         (lerobots / name).write_text("{}")
         assert words in remedied(lerobots)
         (lerobots / name).unlink()

@@ -9,6 +9,7 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.workshop.judge.camera_use import FRAMES, look
 from rover_lib.workshop.judge.compare import fidelity
+from rover_lib.workshop.judge.recorded_range import follows
 
 RANGE = {"steering": (-0.5, 0.5), "throttle": (0.0, 0.2)}
 CHUNK = 4
@@ -82,3 +83,7 @@ def test_an_action_that_never_changes_is_not_judged():
     found = looked(Known(looks=np.array([1, 0]), copies=1), action_range=RANGE | {"throttle": (0.1, 0.1)})
     assert found.warnings() == [] and found.summary()["throttle_by_picture_pct"] is None
     assert "not judged" in str(found.table())
+
+
+def test_a_plan_follows_what_moves_it_by_a_tenth_and_by_1_percent():
+    assert follows(1.1, 10.0) and not follows(1.0, 5.0) and not follows(2.0, 20.0) and follows(2.1, 20.0)

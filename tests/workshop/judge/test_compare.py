@@ -64,10 +64,8 @@ def test_errors_by_hand(report):
     assert report.relative("static") == pytest.approx(0.008, rel=1e-4)  # of 1, as no plan is larger
 
 
-def test_padded_steps_count_in_the_plan_but_not_against_the_recording(report):
-    found = report.summary("static")
+def test_padded_steps_do_not_count_against_the_recording(report):
     assert report.is_pad.sum() == 2
-    assert found["steering_mae_pct"] == pytest.approx(0.008 / 6 / 0.8 * 100, rel=1e-4)
     # FP32 against a recorded (0, 0): the steps 0.1, 0.2, 0.3 of frame 1, and 0.1 of frame 2
     recorded = report.recorded_error(report.reference)
     assert recorded["steering_vs_recorded_pct"] == pytest.approx(0.7 / 4 / 0.8 * 100, rel=1e-4)
@@ -152,10 +150,9 @@ def policies(tmp_path):
 
 
 def test_metrics_say_sizes_hits_and_pairs(report, policies):
-    trials = {
-        mode: SimpleNamespace(hits=39 + last, trials=40, hit=(*[True] * 39, last))
-        for mode, last in (("fp32", True), ("static", False))
-    }
+    trials = {}
+    for mode, last in (("fp32", True), ("static", False)):
+        trials[mode] = SimpleNamespace(hits=39 + last, trials=40, hit=(*[True] * 39, last))
     found = compare.metrics(report, policies, trials)
     static = found["modes"]["static"]
     assert (static["hits"], static["trials"], static["size_mb"]) == (39, 40, 1.0)

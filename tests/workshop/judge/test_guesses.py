@@ -79,9 +79,7 @@ def test_each_action_must_beat_the_guesses(plan, lost, episodes):
 def test_a_policy_no_better_than_a_constant_is_named_with_its_figures():
     """As a racing car's policy that was called ready: 2.60 % off in steering, a constant 2.64 %."""
     (line,) = judge(lambda s: s.chunk * [0.02, 1]).warnings()
-    figures = (
-        r"2\d\.\d\d % off the driver, a constant 2\d\.\d\d %; better by 0\.\d points \(0\.\d to 0\.\d\) over 6 episodes"
-    )
+    figures = r"2\d\.\d\d % off the driver, a constant 2\d\.\d\d %; better by 0\.\d points \(0\.\d to 0\.\d\) over 6"
     assert re.search(figures, line) and line.startswith("steering is not clearly better than a guess without eyes")
 
 
@@ -138,9 +136,8 @@ def test_where_no_action_varies_nothing_is_shown(moves):
     straight = drive(0)
     for s in straight:
         s.chunk = np.tile(np.float32([0, 0.4]), (CHUNK, 1))
-    report = report_of(
-        straight, np.stack([s.chunk for s in straight]), {"steering": (0, 0), "throttle": (0.4, 0.4 + moves)}
-    )
+    ranges = {"steering": (0, 0), "throttle": (0.4, 0.4 + moves)}
+    report = report_of(straight, np.stack([s.chunk for s in straight]), ranges)
     (line,) = against_guesses(report, straight).warnings()
     assert line == "no action varies enough in these recordings to show whether the policy sees"
 
@@ -149,9 +146,8 @@ def test_blocks_of_long_drives_are_drawn_as_a_whole():
     samples = drive(0, frames=600)
     for s in samples:
         s.block = f"block {s.row // 100}"
-    assert (
-        against_guesses(report_of(samples, np.stack([noisy(s) for s in samples]), RANGE), samples).drawn == "6 blocks"
-    )
+    report = report_of(samples, np.stack([noisy(s) for s in samples]), RANGE)
+    assert against_guesses(report, samples).drawn == "6 blocks"
 
 
 def test_the_guesses_know_only_what_could_be_learned_from():

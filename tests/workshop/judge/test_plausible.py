@@ -27,10 +27,8 @@ def driven(tiny):
     plans = predictions(ACT(tiny.config, tiny.weights), [inputs_of(s, tiny.config) for s in samples]).numpy()
     noisy = plans + rng.normal(0, 0.1, plans.shape) * plans.std((0, 1))
     none = np.zeros(plans.shape[1], bool)
-    return [
-        Driven(s.state, s.picture, i, "episode_1", chunk=noisy[i], is_pad=none, time_s=i / 30)
-        for i, s in enumerate(samples)
-    ]
+    recorded = [{"chunk": chunk, "is_pad": none, "time_s": i / 30} for i, chunk in enumerate(noisy)]
+    return [Driven(s.state, s.picture, i, "episode_1", **recorded[i]) for i, s in enumerate(samples)]
 
 
 def ranges(driven):
@@ -66,10 +64,9 @@ def test_statistics_of_other_recordings_are_said(tiny, driven, changes, says):
 def test_a_held_throttle_may_be_planned_as_a_constant(tiny, driven, planned, fit):
     """Within a range as narrow as a hair, a hundredth beside it is not far outside."""
     throttle = 0.4 + 0.0005 * np.sin(np.arange(len(driven)))
-    held = [
-        replace(s, chunk=np.column_stack([s.chunk[:, 0], np.full(len(s.chunk), t)]))
-        for s, t in zip(driven, throttle, strict=True)
-    ]
+    held = []
+    for s, t in zip(driven, throttle, strict=True):
+        held.append(replace(s, chunk=np.column_stack([s.chunk[:, 0], np.full(len(s.chunk), t)])))
     constant = Affine((1.0, 1e-6), (0.0, planned))
     assert (of(tiny, held, action_unnorm=constant).warnings() == []) == fit
 

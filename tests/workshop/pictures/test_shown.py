@@ -1,6 +1,6 @@
 """Pictures that are whole and show nothing, or something else than the other drives': each is named by its fault."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -11,19 +11,11 @@ import pytest
 from balloon_world.world import World
 from rover_lib.workshop.pictures.shown import with_faults
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample
+from rover_lib.workshop.recordings.samples import Episode, Recordings
 from rover_lib.workshop.recordings.source import Source
-from tests.helpers.recorded import real_recordings
+from tests.helpers.recorded import PictureSample, real_recordings
 
 FRAMES, DRIVES = 60, 6
-
-
-@dataclass(frozen=True, eq=False)
-class Seen(Sample):
-    picture: np.ndarray | None = None
-
-    def frame_bgr(self, least=0):
-        return self.picture
 
 
 @cache
@@ -48,15 +40,16 @@ def recordings(change, odd=(0, 1)):
         samples = []
         for k in range(FRAMES):
             numbers = actions[max(k - 1, 0)], actions[k : k + 1], np.zeros(1, bool)
-            samples.append(Seen(f"e{d}", Path("x.jpg"), k / 20, *numbers, k, picture=np.ascontiguousarray(seen[k])))
+            samples.append(
+                PictureSample(f"e{d}", Path("x.jpg"), k / 20, *numbers, k, picture=np.ascontiguousarray(seen[k]))
+            )
         episodes.append(Episode(f"e{d}", Path("r"), "", FRAMES / 20, FRAMES, FRAMES, tuple(samples), ()))
     return with_faults(Recordings(Path("r"), tuple(episodes), (), Source(Path("r"))))
 
 
 def frozen(pictures, first=20, count=25):
-    return np.concatenate(
-        [pictures[:first], np.repeat(pictures[first : first + 1], count, 0), pictures[first + count :]]
-    )
+    still = np.repeat(pictures[first : first + 1], count, 0)
+    return np.concatenate([pictures[:first], still, pictures[first + count :]])
 
 
 def blank(value, share=2):
@@ -104,10 +97,10 @@ def test_a_car_that_stands_may_see_the_same():
     still = recordings(lambda pictures: pictures)
     episodes = []
     for episode in still.episodes:
-        samples = [
-            replace(s, chunk=s.chunk * (1, s.row > 30), picture=episode.samples[max(s.row, 30)].picture)
-            for s in episode.samples
-        ]
+        samples = []
+        for s in episode.samples:
+            picture = episode.samples[max(s.row, 30)].picture
+            samples.append(replace(s, chunk=s.chunk * (1, s.row > 30), picture=picture))
         episodes.append(replace(episode, samples=tuple(samples)))
     assert with_faults(replace(still, episodes=tuple(episodes))).faults == ()
 

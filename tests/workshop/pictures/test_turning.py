@@ -1,6 +1,6 @@
 """Which side positive steering turns to, on pictures of which it is known."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,24 +8,16 @@ import pytest
 
 from rover_lib.workshop.pictures.turning import LEAST_SPREAD, measure_sides
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample
+from rover_lib.workshop.recordings.samples import Episode, Recordings
 from rover_lib.workshop.recordings.source import Source
-from tests.helpers.recorded import pass_a_wall, real_recordings
-
-
-@dataclass(frozen=True, eq=False)
-class Seen(Sample):
-    picture: np.ndarray | None = None
-
-    def frame_bgr(self, least=0):
-        return self.turned(self.picture)
+from tests.helpers.recorded import PictureSample, pass_a_wall, real_recordings
 
 
 def drive(name, gain, amplitude=0.3, frames=120, seed=0):
     samples = []
     for i, (steering, frame) in enumerate(pass_a_wall(gain, amplitude, frames, seed)):
         chunk = np.float32([[steering, 0.05]])
-        samples.append(Seen(name, Path("x"), i / 30, chunk[0], chunk, np.zeros(1, bool), i, picture=frame))
+        samples.append(PictureSample(name, Path("x"), i / 30, chunk[0], chunk, np.zeros(1, bool), i, picture=frame))
     return Episode(name, Path(name), "", frames / 30, frames, frames, tuple(samples), ())
 
 
@@ -47,7 +39,7 @@ def test_what_disagrees_with_the_others_is_mirrored():
     sides = measure_sides(recordings(*(drive(f"e{i}", 8 if i == 2 else -8, seed=i) for i in range(4))))
     assert sides.side == "right" and sides.mirrored == ["e2"] and sides.words().endswith("mirrored: e2")
     odd = drive("e2", 8, seed=2)
-    turned = replace(odd, samples=tuple(Seen(**{**vars(s), "mirrored": True}) for s in odd.samples))
+    turned = replace(odd, samples=tuple(replace(s, mirrored=True) for s in odd.samples))
     assert measure_sides(recordings(turned)).side == "right"
     assert measure_sides(recordings()).words() == ""
     assert "too little" in measure_sides(recordings(drive("a", 0))).words()

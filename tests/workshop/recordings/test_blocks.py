@@ -23,9 +23,8 @@ def drive(count, name="tub from 0", begin_s=0.0, session="s"):
         following = np.minimum(k + np.arange(CHUNK), count - 1)
         chunk = np.stack([following + first] * 2, 1).astype(np.float32)
         samples.append(Sample(name, Path("p.jpg"), k / RATE_HZ, chunk[0], chunk, k + np.arange(CHUNK) >= count, k))
-    return Episode(
-        name, Path("tub"), "", count / RATE_HZ, count, count, tuple(samples), (), {}, False, session, begin_s
-    )
+    counts = count / RATE_HZ, count, count
+    return Episode(name, Path("tub"), "", *counts, tuple(samples), (), {}, False, session, begin_s)
 
 
 def parted(episodes, share=0.25, seed=0):
@@ -58,10 +57,8 @@ def test_each_tub_has_enough_stretches_for_a_limit():
 
 def test_drives_of_seconds_and_many_of_them_are_parted_whole():
     long = replace(drive(100, "e0"), duration_s=90.0)
-    for episodes in (
-        [drive(100, f"e{i}", session="") for i in range(5)],
-        [replace(long, id=f"e{i}") for i in range(20)],
-    ):
+    short = [drive(100, f"e{i}", session="") for i in range(5)]
+    for episodes in (short, [replace(long, id=f"e{i}") for i in range(20)]):
         assert name_long_drives(episodes) == (tuple(episodes), ())
         assert block_of(episodes[0].samples[0]) == "e0"
     (few, *_), ((*names,),) = name_long_drives([drive(2400, session=""), drive(2400, "tub from 1", session="")])

@@ -530,9 +530,8 @@ def test_times_that_are_not_quite_those_of_a_videos_pictures_are_repaired_or_nam
     recordings = load_recordings(root, CHUNK)
     assert [(fault.kind, fault.handled) for fault in recordings.faults] == [("other_times", "repaired")]
     assert "episode 1: from_timestamp is 0.2 ms off" in recordings.faults[0].note
-    assert all(
-        np.array_equal(sample.frame_bgr(), picture) for sample, picture in zip(recordings.samples, right, strict=True)
-    )
+    for sample, picture in zip(recordings.samples, right, strict=True):
+        assert np.array_equal(sample.frame_bgr(), picture)
     table(root / EPISODES_AT, shifted(0.02))
     assert "episode 1: from_timestamp is 20 ms off" in refused(root)
 
