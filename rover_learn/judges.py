@@ -41,7 +41,7 @@ class Judges:
         acted = chunks[~is_pad]
         ranges = np.maximum(np.ptp(actions, axis=0), SMALLEST_RANGE)
         blind_pct = 100 * least_blind_errors(learned, learned_pad, chunks, is_pad) / ranges
-        # By what is learned from: the verdict holds each action that hardly varies there, so what was held here is held.
+        # By what is learned from: what hardly varies there, and is held here, is held by the verdict too.
         varies = [np.ptp(acted[:, i]) > 0 and not hardly_varies(name, actions[:, i]) for i, name in enumerate(names)]
         return cls(names, chunks, is_pad, ranges, blind_pct, np.array(varies))
 

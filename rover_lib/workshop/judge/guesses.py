@@ -165,7 +165,8 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample]) -> Judged | Non
     recorded = report.recorded
     is_pad = report.is_pad
     half = recorded.shape[1] // 2
-    blind = blind_plans(*stack_chunks(learned))
+    chunks, padded = stack_chunks(learned)
+    blind = blind_plans(chunks, padded)
     own = frame_errors(report.reference, recorded, is_pad)
     errors = {name: frame_errors(plan, recorded, is_pad) for name, plan in blind.items()}
     compared = {MEAN_PLAN: (errors[MEAN_PLAN], own)}
@@ -173,7 +174,6 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample]) -> Judged | Non
     if states.shape[1] == len(report.action_names):
         later = recorded[:, half:], is_pad[:, half:]
         compared[LAST] = frame_errors(states[:, None], *later), frame_errors(report.reference[:, half:], *later)
-    learned_actions = np.concatenate([s.chunk[~s.is_pad] for s in learned])
     drawn, pieces = _pieces(report)
     draws = np.random.default_rng(0).integers(0, len(pieces), (DRAWS, len(pieces)))
     actions = {}
@@ -187,7 +187,7 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample]) -> Judged | Non
                 guesses[name] = _guess(pct * of_guess[:, i], pct * of_policy[:, i], pieces, draws)
         acted = recorded[~is_pad][:, i]
         error = own[:, i].mean()
-        is_constant = hardly_varies(action, acted) or hardly_varies(action, learned_actions[:, i])
+        is_constant = hardly_varies(action, acted) or hardly_varies(action, chunks[~padded][:, i])
         size = float(np.abs(acted).mean())
         actions[action] = ActionJudged(float(pct * error), guesses, is_constant, float(error / size) if size else 0.0)
     return Judged(actions, drawn)
