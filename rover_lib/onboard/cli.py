@@ -399,14 +399,10 @@ def stage(releases: Any, source: Path, **options: Any) -> None:
 
 @release.command(short_help="Verify that a release computes what it should.")
 @click.argument("name", default="current")
-@click.option("--confined", is_flag=True, help="First drop all rights that an inference does not need.")
 @click.pass_obj
-def verify(releases: Any, name: str, confined: bool) -> None:
+def verify(releases: Any, name: str) -> None:
     """Verify that a release is complete and computes here what it should, by checksums and parity vectors."""
-    if confined:
-        releases.verify(name, confined=True)
-    else:
-        releases.check(name)
+    releases.check(name)
     click.echo(f"{name}: verified")
 
 
