@@ -176,14 +176,6 @@ def test_who_was_refused_may_ask_again(systemd):
     assert answers[0][2] == "driving: armed by a human"
 
 
-def test_nobody_can_ask_for_the_car_while_it_drives(systemd):
-    """Such a request would arm it again as soon as that drive ends."""
-    with served() as service:
-        with beside(systemd, ask_to_arm) as asked:
-            assert service.wait_for_human(armed) == "telemetry"
-        assert asked[0]["armed"] and s.ask_service(ask="state")["ticket"] == ""
-
-
 @pytest.mark.parametrize("old", [{"asked_s": s} for s in (-1e9, math.nan, math.inf, 101.0)] + [{"asked_s": 100.0}])
 def test_an_operator_who_asked_long_ago_is_asked_again(systemd, monkeypatch, old):
     """The camera was slow, or this process was stopped: the car must not set off when nobody expects it any more."""
@@ -358,9 +350,6 @@ def test_another_user_arms_nothing_even_if_the_socket_is_open_to_all(systemd, mo
     assert "connect" not in done.stderr and "ab12" not in done.stdout, done  # it got no answer, or was cut off
 
 
-# rover arm-car
-
-
 def test_a_service_that_is_not_there_is_not_armed(tmp_path, monkeypatch):
     script = tmp_path / "systemctl"
     script.write_text("#!/bin/sh\nprintf 'LoadState=loaded\\nActiveState=inactive\\nStatusText=driving: x\\n'\n")
@@ -400,9 +389,6 @@ def test_ages_of_consent_go_on_while_the_machine_is_suspended(monkeypatch):
     clocks = [(s.Service, "clock"), (wanted_since, "clock"), (Session, "now")]
     assert [inspect.signature(what).parameters[name].default() for what, name in clocks] == [5000.0] * 3
     assert DriveOptions(Path("policy.pt")).asked_s == 5000.0
-
-
-# Arming
 
 
 def session_of(asked_s=0.0, renew=lambda age_s: None, **parts):
@@ -466,9 +452,6 @@ def test_a_drive_that_waits_in_a_terminal_does_not_arm_later(missing):
     wanted = wanted_since(0.0, iter([3600.0] if missing == "-" else [20.0, 31.0]).__next__)
     with pytest.raises(s.RoverError, match="at most 30"):
         arm_when_ready(lambda: pytest.fail("armed"), lacking(iter(missing)), threading.Event(), print, (), wanted)
-
-
-# The whole: rover drive --service, as systemd starts it
 
 
 def test_a_service_is_armed_by_a_human_and_a_loop_that_hangs_is_not_fed_for(systemd, tmp_path, demo_run):
