@@ -13,6 +13,7 @@ import re
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -131,7 +132,7 @@ def car_of(manifest: dict[str, Any]) -> Car:
         raise ArtifactError(str(error), remedy="export it again") from None
 
 
-class Artifact:
+class Artifact(AbstractContextManager["Artifact"]):
     """An artifact that is opened once, and carries on what was read of it and checked. All raise ArtifactError.
 
     with Artifact("policy_static.pt") as artifact:
@@ -141,9 +142,6 @@ class Artifact:
     def __init__(self, path: Path | str):
         self.path = Path(path)
         self._z = open_archive(path)
-
-    def __enter__(self) -> "Artifact":
-        return self
 
     def __exit__(self, *exc: object) -> None:
         self._z.close()
@@ -213,7 +211,6 @@ class Artifact:
 
     @property
     def names(self) -> list[str]:
-        """The names of its records."""
         return self._z.namelist()
 
     @property

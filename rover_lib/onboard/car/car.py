@@ -88,7 +88,6 @@ class Car:
 
     @property
     def reverses(self) -> bool:
-        """Whether it can drive backwards."""
         return self.pwm.throttle.low < 0
 
     @property

@@ -93,7 +93,8 @@ class ServoLink:
 
     def __init__(self, port: str, *, car: Car | None = None, clock: Callable[[], float] = time.monotonic):
         """port: "" means the only Arduino's. car: None means this machine's. Raises RoverError if either is unclear."""
-        self.port, self.car = port or find_port(), car or this_car()
+        self.port = port or find_port()
+        self.car = car or this_car()
         self.calibration = self.car.pwm
         self._clock = clock
         self._gamepad: Gamepad | None = None
@@ -244,7 +245,8 @@ class ServoLink:
         """
         hello = self.hello
         with self._heard:
-            before, self._requested = self._requested or self._telemetry, None
+            before = self._requested or self._telemetry
+            self._requested = None
         if hello and before and before.boot != hello.boot:
             raise LinkError(f"{self.port}: the Arduino was reset since the car was asked for", remedy="ask again")
         if hello and self._told_boot != hello.boot:
@@ -302,7 +304,8 @@ class ServoLink:
         while self._clock() < end:
             number = self._send(kind, *values)
             first = number if first is None else first
-            until, telemetry = self._clock() + REPEAT_S, None
+            until = self._clock() + REPEAT_S
+            telemetry = None
             while (rest_s := until - self._clock()) > 0:
                 self._await(lambda: self._telemetry is not telemetry, rest_s)  # noqa: B023
                 telemetry = self._telemetry
@@ -425,7 +428,8 @@ class ServoLink:
         heard = self._telemetry
         if not heard or heard.host_s != now or now - self._relayed_s < RELAY_EVERY_S:
             return
-        self._relayed_s, pulses_us = now, (0, 0)
+        self._relayed_s = now
+        pulses_us = (0, 0)
         if sticks := gamepad.sticks():
             channel = self.calibration.throttle
             # Also backwards on a car that cannot, and beyond a small cap: the Arduino judges the stick, then limits it.
@@ -456,7 +460,8 @@ class ServoLink:
                     self._unanswered.clear()
                 self.hello = message
             else:
-                before, self._telemetry = self._telemetry, message
+                before = self._telemetry
+                self._telemetry = message
                 if not before or (before.boot, before.state) != (message.boot, message.state):
                     self.turned = message
                 while self._unanswered and _reached(message, self._unanswered[0][0]):

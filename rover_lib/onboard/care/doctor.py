@@ -1,8 +1,5 @@
 """Check everything that driving needs, and say in one line each what was found and what to do about it.
 
-    for check in examine("policy_static.pt", camera="0"):
-        print(check)
-
 "fail" means that the car would not drive, "warning" that it would drive worse or stop more often than it could.
 """
 
@@ -81,7 +78,8 @@ def examine(
 
     artifact: the policy to check. camera, port: as for `rover drive`. log_folder: where flight logs go [this folder].
     """
-    host, manifest = host or Host(), None
+    host = host or Host()
+    manifest = None
     with contextlib.suppress(ArtifactError, OSError):  # the artifact's own check reports it
         manifest = read_manifest(artifact) if artifact else None
     size = seen_size(manifest) if manifest else None
@@ -152,7 +150,6 @@ def camera_rate(source: Path | str, seen: tuple[int, int] | None = None, *, rate
 
 
 def _newest_after(camera: Any, seconds: float) -> Frame:
-    """Watch a camera for a while, and return its last frame."""
     end, last = time.monotonic() + seconds, camera.latest()
     while (rest_s := end - time.monotonic()) > 0 and (frame := camera.wait(last.number, rest_s)):
         last = frame

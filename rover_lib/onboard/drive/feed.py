@@ -1,8 +1,5 @@
 """The drive's end of the view: it sends what the view shows, and accepts one request, a stop.
 
-    feed = Feed(place, log, title="policy_static.pt")
-    drive(..., until=Until(over=feed.over), hooks=Hooks(show=partial(feed.tick, report, camera, pilot)))
-
 The view is another process; on a rover, another user runs it. It listens at a Unix socket that transports whole
 messages. Neither side waits for the other: a message is dropped while the previous one has not been read, so that a
 view that hangs, floods or dies costs a drive no more than a failed system call.

@@ -1,8 +1,5 @@
 """The control loop: it sends a command at each absolute deadline, and every fault ends in a stopped car.
 
-    with ServoLink(port) as link:
-        report = drive(pilot, link, log, rate_hz=30, until=Until(max_seconds=60))
-
 Whatever ends the loop, the next command is neutral. If that does not get through, the Arduino stops the car by itself
 150 ms after the last command.
 """

@@ -187,7 +187,9 @@ class PolicyPilot:
 
     def warnings(self) -> Iterator[str]:
         """Yield sentences about how late camera and policy were since the last call."""
-        age_s, asking_s, plan = self._frame_age_s, self._asking_s, self._follower.plan
+        age_s = self._frame_age_s
+        asking_s = self._asking_s
+        plan = self._follower.plan
         self._frame_age_s = self._asking_s = 0.0
         if self._cut > CUT and not self._said_cut:
             self._said_cut, limit = True, self._settings.throttle_limit

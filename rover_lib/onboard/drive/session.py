@@ -37,13 +37,9 @@ TAKEN_OVER = "the human drives, and is recorded until the sticks are let go"
 
 @dataclass(frozen=True)
 class DriveOptions:
-    """The options of `rover drive`.
+    """The options of `rover drive`, whose help explains them. None: as there.
 
-    hz: commands per second. dry_run: no motor is driven. record: folder in which an episode is written. record_mb: how
-    much all episodes in it may take together; None: limited by the disk. max_seconds, ticks: when to end.
-    throttle_limit: replaces that of params.yml. threads: of the policy; None: all cores but one. log_file: None: the
-    user's. service: run as a systemd service, disarmed until a human arms it. latency_ms: make each plan take at least
-    this long, for comparisons. view: the socket of a view; None: the user's. asked_s: when the car was asked for, by
+    latency_ms: make each plan take at least this long, for comparisons. asked_s: when the car was asked for, by
     boottime().
     """
 
@@ -165,20 +161,19 @@ class Session:
         return self.feed.over()
 
 
-class Arming:
+class Arming(AbstractContextManager["Arming"]):
     """Prepares a drive and arms the car; a context manager, whose end finishes the episode and lowers the priority."""
 
     def __init__(self, session: Session, pilot: PolicyPilot):
-        self._session, self._pilot, options = session, pilot, session.options
+        self._session = session
+        self._pilot = pilot
+        options = session.options
         self._room: int | None = None
         if options.record and options.record_mb:
             self._room = room_for(options.record, options.record_mb)  # now, because it may take a while
         self._recorder: TakeoverRecorder | None = None
         self._armed: Telemetry | None = None
         self._driving, self._opened = ExitStack(), ExitStack()  # the second contains the first
-
-    def __enter__(self) -> "Arming":
-        return self
 
     def __exit__(self, *exc: Any) -> None:
         if self._recorder:
@@ -225,13 +220,10 @@ class Arming:
         recorder, log = self._recorder.recorder, session.log
         log.event(TAKEN_OVER)
         try:
-            options: dict[str, Any] = {
-                "rate_hz": session.options.hz,
-                "stop": stop,
-                "over": over,
-                "clock": session.clock,
-            }
-            takeover = self._recorder.human(session.link, self._armed, **options)
+            rate_hz = session.options.hz
+            takeover = self._recorder.human(
+                session.link, self._armed, rate_hz=rate_hz, stop=stop, over=over, clock=session.clock
+            )
             recorder.note(takeover=vars(takeover))
             log.event(str(takeover))
             recorder.close(takeover.ended if takeover.fault else None)

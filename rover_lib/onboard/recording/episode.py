@@ -110,7 +110,8 @@ class EpisodeWriter:
         self._rows: dict[str, FileIO] = {}
         self._damaged: set[Any] = set()  # pictures that a kill or a power cut has left without their end
         self._left_out = 0  # damaged rows and pictures
-        self._closing, self._syncing = threading.Event(), threading.Thread(target=self._keep_synced, daemon=True)
+        self._closing = threading.Event()
+        self._syncing = threading.Thread(target=self._keep_synced, daemon=True)
         self._unsynced: OSError | None = None
 
     def __enter__(self) -> "EpisodeWriter":
@@ -241,7 +242,9 @@ class EpisodeWriter:
             shutil.rmtree(self._part, ignore_errors=True)
         if self._lock is not None:
             os.close(self._lock)
-        self._rows, self._part, self._lock = {}, None, None
+        self._rows = {}
+        self._part = None
+        self._lock = None
 
     def _take(self, part: Path, lock: int) -> None:
         """Go on with what an ended process has left in a hidden folder."""
@@ -307,7 +310,6 @@ class EpisodeWriter:
             raise EpisodeError(f"{self.folder}: exists already", remedy=remedy, kind="exists")
 
     def _write(self, part: Path) -> None:
-        """Write the three files in the hidden folder."""
         if not self.controls or not self.frames:
             content = f"{self.controls} controls and {self.frames} frames"
             remedy = f"check that the camera and the Arduino deliver; {part.name} has what there is"
