@@ -42,7 +42,7 @@ Watch = Callable[[Order], bool]
 
 
 @dataclass(frozen=True)
-class Driven:
+class WorldDrive:
     """A drive through a world.
 
     outcome: a World's, 'stopped' if a plan became too old to drive by or a place was unfamiliar, or
@@ -87,7 +87,7 @@ class TimedCar:
         self._coming: Plan | None = None
         self._think(ROUNDING)
 
-    def drive(self, settings: Settings, log: Any, watch: Watch | None = None) -> Driven:
+    def drive(self, settings: Settings, log: Any, watch: Watch | None = None) -> WorldDrive:
         """Drive by the car's own loop until the world ends or `stop` is set."""
         settings = settings if self.draws else replace(settings, stuck_s=0.0)
         pilot = WorldPilot(self, self._commanded, settings, self.policy.rate_hz, watch)
@@ -96,8 +96,8 @@ class TimedCar:
         except DriveFault as fault:
             if fault.__cause__:  # the policy failed; without a cause, a plan had become too old
                 raise fault.__cause__ from None
-            return Driven("stopped", pilot.orders)
-        return Driven(self.world.outcome or "taken over", pilot.orders)
+            return WorldDrive("stopped", pilot.orders)
+        return WorldDrive(self.world.outcome or "taken over", pilot.orders)
 
     def clock(self) -> float:
         return self._tick / RATE_HZ
@@ -166,7 +166,7 @@ class WorldPilot(PolicyPilot):
             self._car.stop.set()  # the drive ends after this tick
 
 
-def drive_in(policy: Any, world: World, latency_s: float, settings: Settings, watch: Watch | None = None) -> Driven:
+def drive_in(policy: Any, world: World, latency_s: float, settings: Settings, watch: Watch | None = None) -> WorldDrive:
     """Drive through a world until it has ended.
 
     policy: an artifact's Policy, or anything else with `rate_hz` and `predict_unclipped`. latency_s: from taking the

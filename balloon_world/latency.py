@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from balloon_world.drives import SEED, Driven, count_hits, drive_in, everywhere, path_of
+from balloon_world.drives import SEED, WorldDrive, count_hits, drive_in, everywhere, path_of
 from balloon_world.level import EASY, level_named
 from balloon_world.world import World
 from rover_lib.onboard.artifact.manifest import content_hash
@@ -61,7 +61,7 @@ def measure_latencies(
         if ms:  # a plan that takes no time leaves nothing to compensate
             rows.append(conditions | {"compensate": False})
 
-    def one(policy: Any, question: tuple[int, int]) -> Driven:
+    def one(policy: Any, question: tuple[int, int]) -> WorldDrive:
         row = rows[question[0]]
         seed = question[1]
         own_settings = replace(settings, compensate=row["compensate"])
@@ -70,7 +70,7 @@ def measure_latencies(
     questions = list(product(range(len(rows)), range(SEED, SEED + worlds)))
     drives = dict(progress(everywhere(artifact, questions, one), desc="driving", total=len(questions)))
     for i, row in enumerate(rows):
-        row |= _found([drives[i, seed] for seed in range(SEED, SEED + worlds)])
+        row |= _count_outcomes([drives[i, seed] for seed in range(SEED, SEED + worlds)])
     metrics = {"rows": rows, "gates": gates(rows, limit_pct)}
     return write_stage(artifact.with_name("drive.json"), "drive", params=parameters, metrics=metrics, inputs=inputs)
 
@@ -101,7 +101,7 @@ def pushed_on_map(
     return maps
 
 
-def _found(drives: Sequence[Driven]) -> dict[str, Any]:
+def _count_outcomes(drives: Sequence[WorldDrive]) -> dict[str, Any]:
     """Return what a row of drive.json says of its drives."""
     outcomes = [d.outcome for d in drives]
     counts = count_hits(outcomes) | {
