@@ -75,7 +75,9 @@ def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Ite
             raise refused(path, f"its manifest says {manifest['mode']}, its code is not")
         for kind, why in expected.refusals(manifest).items():
             if kind not in allow:
-                remedy = f"deploy another, or allow it: {kind}" if kind in MAY_DIFFER else "deploy another"
+                remedy = "deploy another"
+                if kind in MAY_DIFFER:
+                    remedy += f", or allow it: {kind}"
                 raise ArtifactError(f"{path}: {why}", remedy=remedy)
         _ = artifact.parity  # has the shapes that the manifest says
     return artifact

@@ -175,7 +175,10 @@ class Artifact(AbstractContextManager["Artifact"]):
                 continue
             if name in ("archive/data.pkl", *programs):  # each names the class once; all other names there are kept
                 record = record.replace(module, MANGLED.sub(b"", module), 1)
-            digest.update((MANGLED.sub(b"", name.encode()) if name in programs else name.encode()) + b"\0")
+            encoded = name.encode()
+            if name in programs:
+                encoded = MANGLED.sub(b"", encoded)
+            digest.update(encoded + b"\0")
             digest.update(hashlib.sha256(record).digest())
         return digest.hexdigest()
 
@@ -200,7 +203,8 @@ class Artifact(AbstractContextManager["Artifact"]):
             raise refused(self.path, f"its parity vectors are not readable ({e})") from None
         for name, (dtype, shape) in expected.items():
             vector = vectors[name]
-            shape = shape if name in fixed else (len(vectors["state"]), *shape)
+            if name not in fixed:
+                shape = (len(vectors["state"]), *shape)
             if vector.dtype != dtype or vector.shape != shape or not len(vector):
                 raise refused(self.path, f"its parity vector {name} has another shape than its manifest says")
             if not np.isfinite(vector).all():

@@ -132,7 +132,9 @@ class Car:
         if self.positive != other.positive:
             return f"steering +1 turns {self.name!r} {self.positive} and {other.name!r} {other.positive}"
         mine, theirs = ((c.pulses_us, c.field_of_view_deg, c.wheelbase_m) for c in (self, other))
-        return "" if mine == theirs else f"{self.name!r} and {other.name!r} differ in pulses, camera or wheelbase"
+        if mine != theirs:
+            return f"{self.name!r} and {other.name!r} differ in pulses, camera or wheelbase"
+        return ""
 
     @property
     def pulses_us(self) -> tuple[int, ...]:
@@ -147,14 +149,16 @@ class Car:
         steering = {"period_us": period_us, "left_us": left_us, "neutral_us": neutral_us, "right_us": right_us}
         throttle = {"period_us": throttle_us, "neutral_us": rest_us, "forward_us": forward_us}
         reverse = {"reverse_us": back_us} if self.reverses else {}
-        return {
+        content = {
             "name": self.name,
             "steering": {**steering, "positive": self.positive},
             "throttle": {**throttle, **reverse, "cap_us": self.cap_us},
             "camera": {"field_of_view_deg": self.field_of_view_deg},
             "wheelbase_m": self.wheelbase_m,
-            **({"human": self.human} if self.human != HUMANS[0] else {}),
         }
+        if self.human != HUMANS[0]:
+            content["human"] = self.human
+        return content
 
     @classmethod
     def of(cls, content: object, where: str = "car.yml") -> "Car":

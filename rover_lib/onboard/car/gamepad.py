@@ -81,7 +81,8 @@ class Gamepad:
         None while the human has let go: L1 is up, the gamepad is gone or silent, after which L1 must be pressed again,
         or it is not known where a stick is. Never waits, raises nothing.
         """
-        now_s = time.monotonic() if now_s is None else now_s
+        if now_s is None:
+            now_s = time.monotonic()
         if self.gone:  # others may have the numbers of its files by now
             return None
         try:

@@ -28,7 +28,6 @@ from rover_lib.onboard.car.protocol import (
     LINE_MAX,
     MISSING,
     PROTOCOL_VERSION,
-    REASONS,  # noqa: F401, for those who show why
     RESULTS,
     SEQUENCES,
     Hello,
@@ -63,11 +62,6 @@ _log = logging.getLogger(__name__)
 
 class LinkError(RoverError):
     """The Arduino is missing, speaks another protocol, refuses to be armed, or no longer answers."""
-
-
-def _reached(telemetry: Telemetry, sequence: int) -> bool:
-    """Whether the Arduino has accepted the command with this number, or a later one."""
-    return (telemetry.sequence - sequence) % SEQUENCES < SEQUENCES // 2
 
 
 def _keep(port: serial.Serial) -> None:
@@ -303,14 +297,15 @@ class ServoLink:
         end = self._clock() + ANSWER_S
         while self._clock() < end:
             number = self._send(kind, *values)
-            first = number if first is None else first
+            if first is None:
+                first = number
             until = self._clock() + REPEAT_S
             telemetry = None
             while (rest_s := until - self._clock()) > 0:
                 self._await(lambda: self._telemetry is not telemetry, rest_s)  # noqa: B023
                 telemetry = self._telemetry
                 # An earlier status says nothing about the command.
-                if telemetry and _reached(telemetry, first) and telemetry.boot == self._boot:
+                if telemetry and telemetry.accepts(first) and telemetry.boot == self._boot:
                     yield telemetry
 
     def send(self, steering_us: int, throttle_us: int) -> int:
@@ -464,6 +459,6 @@ class ServoLink:
                 self._telemetry = message
                 if not before or (before.boot, before.state) != (message.boot, message.state):
                     self.turned = message
-                while self._unanswered and _reached(message, self._unanswered[0][0]):
+                while self._unanswered and message.accepts(self._unanswered[0][0]):
                     self._unanswered.popleft()
             self._heard.notify_all()

@@ -193,7 +193,7 @@ def benchmark(
     metrics = {
         **run.metrics_of(main),
         "peak_memory_mb": run.host.process_peak_memory_mb(),
-        "cpu_pct": 100 * run.process_s / run.wall_s / cores if run.wall_s > 0 else None,
+        "cpu_pct": 100 * run.process_s / run.wall_s / cores,
         "cpu_per_core_pct": run.per_core_pct,
         **_heat_and_clock(run.readings),
         "throttled": run.readings[-1]["throttled"],
@@ -220,7 +220,9 @@ def floor_ms(gmac: float | None, mode: str) -> float | None:
     gmac: 10**9 multiply-accumulates of one inference. mode: an artifact's: `mixed` and `dynamic` count as INT8, a floor
     that they cannot reach.
     """
-    return None if gmac is None else gmac / PI5_GMAC_PER_S["fp32" if mode == "fp32" else "int8"] * 1000
+    if gmac is None:
+        return None
+    return gmac / PI5_GMAC_PER_S["fp32" if mode == "fp32" else "int8"] * 1000
 
 
 class _Run:
@@ -279,8 +281,8 @@ class _Run:
             "latency_mean_ms": mean_ms,
             "latency_max_ms": float(times_ms.max()),
             "n": len(times_ms),
-            "throughput_fps": 1000 / mean_ms if mean_ms > 0 else math.inf,
-            "control_rate_hz": 1000 / p95_ms if p95_ms > 0 else math.inf,
+            "throughput_fps": 1000 / mean_ms,
+            "control_rate_hz": 1000 / p95_ms,
             "peak_memory_mb": None,
             "floor_ms": floor_ms(gmac, mode) if mode else None,
             "gmac": gmac,
@@ -294,8 +296,8 @@ class _Run:
             return {}
         times_ms, reference_ms = (np.asarray(self.latencies_ms[n]) for n in (name, self.timing.reference))
         p50_ms, reference_p50_ms = float(np.median(times_ms)), float(np.median(reference_ms))
-        low, high = np.percentile(reference_ms / np.maximum(times_ms, 1e-9), (5, 95)).tolist()
-        return {"speedup": reference_p50_ms / p50_ms if p50_ms > 0 else None, "speedup_p5": low, "speedup_p95": high}
+        low, high = np.percentile(reference_ms / times_ms, (5, 95)).tolist()
+        return {"speedup": reference_p50_ms / p50_ms, "speedup_p5": low, "speedup_p95": high}
 
     def _read_host(self, passed_s: float) -> None:
         """Keep the host's state. Only a benchmark of minutes asks for the supply, by a process beside what is timed."""

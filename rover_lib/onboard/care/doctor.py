@@ -57,7 +57,9 @@ class Check:
 
     def __str__(self) -> str:
         line = f"{self.verdict:<8} {self.name:<{NAME_WIDTH}} {self.found}"
-        return f"{line}\n{'':{9 + NAME_WIDTH}} {self.remedy}" if self.remedy else line
+        if self.remedy:
+            line += f"\n{'':{9 + NAME_WIDTH}} {self.remedy}"
+        return line
 
 
 def warn_unless(fine: bool, name: str, found: str, remedy: str) -> Check:
@@ -79,10 +81,11 @@ def examine(
     artifact: the policy to check. camera, port: as for `rover drive`. log_folder: where flight logs go [this folder].
     """
     host = host or Host()
-    manifest = None
+    manifest = size = None
     with contextlib.suppress(ArtifactError, OSError):  # the artifact's own check reports it
-        manifest = read_manifest(artifact) if artifact else None
-    size = seen_size(manifest) if manifest else None
+        if artifact:
+            manifest = read_manifest(artifact)
+            size = seen_size(manifest)
     device = path_of(str(camera))
     checks: dict[str, Callable[[], Iterable[Check]]] = {}
     if device.is_relative_to(DEV):  # otherwise it is a file or a pipe, and no camera needs to be there
@@ -134,7 +137,9 @@ def camera_rate(source: Path | str, seen: tuple[int, int] | None = None, *, rate
         if seen:
             check_shape(str(source), last.image, seen)
     number = last.number - first.number
-    measured_hz = number / (last.captured_s - first.captured_s) if number and last.captured_s > first.captured_s else 0
+    measured_hz = 0.0
+    if last.captured_s > first.captured_s:
+        measured_hz = number / (last.captured_s - first.captured_s)
     height, width = last.image.shape[:2]
     finding = f"{source}: {width}x{height}, {clock} time stamps, {measured_hz:.1f} frames a second"
     settings = Settings.of(params()["drive"])
@@ -181,7 +186,8 @@ def _transmitter(link: ServoLink) -> Check:
         return Check("transmitter", "fail", finding, remedy)
     finding = f"steering {steering_us} us, throttle {throttle_us} us"
     rests = abs(throttle_us - link.calibration.throttle.pulse_us(0.0)) <= REST_US
-    finding += "" if rests else ": arming will be refused"
+    if not rests:
+        finding += ": arming will be refused"
     return warn_unless(rests, "transmitter", finding, "let go of the throttle")
 
 

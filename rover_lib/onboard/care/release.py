@@ -27,7 +27,7 @@ from filelock import Timeout
 from rover_lib.onboard.artifact.acceptance import THIS_CAR, Expected, inspect_artifact
 from rover_lib.onboard.durable import sync
 from rover_lib.onboard.errors import RoverError, printable
-from rover_lib.onboard.stage import private_lock, sha256_of
+from rover_lib.onboard.stage import atomic_path, private_lock, sha256_of
 
 POLICY, ORIGIN = "policy.pt", "release.json"
 NAME = re.compile(r"[0-9a-f]{64}")
@@ -263,7 +263,10 @@ class Releases:
     def _tidy(self) -> None:
         ours = (*self.releases.glob(".new"), *self.releases.glob(".gone-*"), *self.models.glob(".new-*"))
         for path in ours:  # other files, such as a .git, stay
-            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
         history = self._history()
         if (current := self.current) in self._by_use() and history[-1:] != [current]:
             self._write_history([*history, current])  # a switch was interrupted before the history was written
@@ -287,12 +290,8 @@ class Releases:
 
     def _write_history(self, names: list[str]) -> None:
         """Write the history, if there is room: a full disk must not prevent a rollback. The next command mends it."""
-        new = self.models / ".new-history"
-        with contextlib.suppress(OSError):
-            new.write_text(json.dumps(names[-HISTORY:], indent=1) + "\n")
-            sync(new)
-            new.replace(self.models / "history.json")
-            sync(self.models)
+        with contextlib.suppress(OSError), atomic_path(self.models / "history.json") as path:
+            path.write_text(json.dumps(names[-HISTORY:], indent=1) + "\n")
 
     def _by_use(self) -> list[str]:
         names = sorted(p.name for p in self.releases.glob("*") if NAME.fullmatch(p.name))

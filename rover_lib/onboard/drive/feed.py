@@ -105,7 +105,9 @@ class Feed:
         now_s = self._clock()
         if now_s < self._due_s:
             return False
-        self._due_s = (self._due_s if now_s < self._due_s + EVERY_S else now_s) + EVERY_S
+        if now_s >= self._due_s + EVERY_S:
+            self._due_s = now_s
+        self._due_s += EVERY_S
         return self._connected()
 
     def _connected(self) -> bool:
@@ -148,10 +150,9 @@ class Feed:
             return False
 
     def _picture(self, camera: Camera) -> tuple[dict[str, Any], bytes]:
-        try:
+        frame = None
+        with contextlib.suppress(RoverError):  # whoever needs the camera reports that it is gone
             frame = camera.latest()
-        except RoverError:  # whoever needs the camera reports that it is gone
-            frame = None
         if frame is None:
             return {}, b""
         height, width = frame.image.shape[:2]
@@ -162,7 +163,9 @@ class Feed:
         """Give the view a message unless it has not read the previous one. Never waits."""
         try:
             if self._socket and not struct.unpack("i", fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4)))[0]:
-                self._socket.send(line + picture if len(line) + len(picture) < MOST_BYTES else line)
+                if len(line) + len(picture) < MOST_BYTES:
+                    line += picture
+                self._socket.send(line)
                 return True
         except BlockingIOError:
             pass

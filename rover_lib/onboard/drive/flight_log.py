@@ -51,7 +51,7 @@ class Tick(NamedTuple):
     t_s: float  # since FlightLog.start_s, by the same clock
     late_ms: float  # how long after its deadline the command went out
     state: str  # who drives: M, A or S as the Arduino says, "" if not known
-    reason: str  # why, a key of servo_link.REASONS
+    reason: str  # why, a key of protocol.REASONS
     steering: float  # commanded, [-1, 1]
     throttle: float  # commanded, [0, 1]
     steering_us: int  # commanded pulses
@@ -377,7 +377,8 @@ def _row(line: bytes) -> list[Any] | Event | tuple[Any, ...] | dict[str, Any] | 
                 return Event(float(t_s), text)
             case {"kind": "machine", "t_s": t_s, "temperature_c": heat, "throttled": bits} if is_number(t_s):
                 valid = (heat is None or is_number(heat)) and (bits is None or THROTTLED_VALUE.fullmatch(bits))
-                return (float(t_s), heat, bits) if valid else None
+                if valid:
+                    return (float(t_s), heat, bits)
             case {"kind": "header", "schema": schema, "drive": dict()} as header if schema == SCHEMA:
                 return header
     except (ValueError, TypeError, RecursionError):

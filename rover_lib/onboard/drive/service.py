@@ -67,7 +67,8 @@ class Request:
 
 def check_age(age_s: float, most_s: float | None = None) -> None:
     """Raise RoverError for a request that is too old: whoever sent it may no longer be watching the car."""
-    most_s = REQUEST_S if most_s is None else most_s
+    if most_s is None:
+        most_s = REQUEST_S
     if not 0 <= age_s <= most_s:  # also refuses NaN, and a time that has not come yet
         problem = f"{age_s:.1f} s have passed since the car was asked for, at most {most_s:g} may"
         raise RoverError(problem, remedy="ask again", kind="not armed")

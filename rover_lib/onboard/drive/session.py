@@ -130,11 +130,16 @@ class Session:
 
     def over(self) -> str | None:
         """Why this drive must end, by its operator or the view; None if it may go on."""
-        return (self.service.over() if self.service else None) or self.feed.over()
+        if self.service and (reason := self.service.over()):
+            return reason
+        return self.feed.over()
 
     def check_wanted(self) -> None:
         """Raise RoverError if whoever asked for the car did so too long ago, or is gone."""
-        (self.service.check_request if self.service else wanted_since(self.options.asked_s, self.now))()
+        if self.service:
+            self.service.check_request()
+        else:
+            check_age(self.now() - self.options.asked_s, WAIT_S)
 
     def _arm(self, arming: "Arming", stop: threading.Event, said: str) -> Telemetry | None:
         """Arm the car for whoever asks for it: a service's operator, or the command itself."""
@@ -231,11 +236,6 @@ class Arming(AbstractContextManager["Arming"]):
             log.event(f"the human is not recorded: {sentence_of(error)}", level=logging.ERROR)
 
 
-def wanted_since(asked_s: float, clock: Callable[[], float] = boottime) -> Callable[[], None]:
-    """Return a check for a car that was asked for at asked_s: it raises once that is over WAIT_S ago."""
-    return lambda: check_age(clock() - asked_s, WAIT_S)
-
-
 def arm_when_ready(
     arm: Arm,
     link: ServoLink,
@@ -249,7 +249,8 @@ def arm_when_ready(
     checks: called while waiting; each raises if its device fails. still_wanted: raises if the human asked too long ago;
     None: they ask now. Raises RoverError when told to stop.
     """
-    still_wanted = still_wanted or wanted_since(boottime())
+    asked_s = boottime()
+    still_wanted = still_wanted or (lambda: check_age(boottime() - asked_s, WAIT_S))
     link.request()
     message = ""
     while missing := what_is_missing(link):
@@ -268,7 +269,9 @@ def arm_when_ready(
 def what_is_missing(link: ServoLink) -> str:
     """Return what a human must do before the Arduino can be armed, "" if nothing. Raises LinkError."""
     telemetry = link.latest()
-    return link.remedy(telemetry.missing) if telemetry and telemetry.missing != "-" else ""
+    if not telemetry or telemetry.missing == "-":
+        return ""
+    return link.remedy(telemetry.missing)
 
 
 def arm_capped(

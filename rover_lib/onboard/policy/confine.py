@@ -94,7 +94,9 @@ def confine(limit_mb: float) -> str:
     add("clone3", REFUSE | errno.ENOSYS)  # its flags are in memory; the C library then takes clone
     failed = next((code for code in codes if code), 0) or library.seccomp_load(context)
     library.seccomp_release(context)
-    return f"the kernel takes no filter of system calls ({os.strerror(-failed)})" if failed else ""
+    if failed:
+        return f"the kernel takes no filter of system calls ({os.strerror(-failed)})"
+    return ""
 
 
 def forbid_opening() -> None:
@@ -104,5 +106,6 @@ def forbid_opening() -> None:
 
 def _lower(limit: int, value: int) -> None:
     maximum = resource.getrlimit(limit)[1]
-    value = value if maximum == resource.RLIM_INFINITY else min(value, maximum)
+    if maximum != resource.RLIM_INFINITY:
+        value = min(value, maximum)
     resource.setrlimit(limit, (value, value))

@@ -266,7 +266,8 @@ class EpisodeWriter:
                 self._first_s, self._last_s = min(self._first_s, row[time]), max(self._last_s, row[time])
                 if kind == "frame" and self.resolution is None:
                     image = cv2.imread(str(part / row["image_path"]))
-                    self.resolution = None if image is None else (image.shape[1], image.shape[0])
+                    if image is not None:
+                        self.resolution = image.shape[1], image.shape[0]
         damaged = f"; {self._left_out} damaged rows and pictures are left out" if self._left_out else ""
         self.metadata["fault"] = f"the recording was cut off{damaged}"
 
@@ -409,10 +410,9 @@ def _rows(part: Path, kind: str) -> Iterator[dict[str, Any] | None]:
     """Yield what was recorded of a kind, row by row; None for a damaged row."""
     with contextlib.suppress(FileNotFoundError), (part / f"{kind}.rows").open("rb") as file:
         for line in file:
-            try:
+            row = None
+            with contextlib.suppress(ValueError):
                 row = json.loads(line)
-            except ValueError:
-                row = None
             yield row if isinstance(row, dict) and KINDS[kind] in row else None
 
 

@@ -167,7 +167,8 @@ class View:
         """Show this on the pages from now on. head: a message as in feed.py. picture: a JPEG, or empty for none."""
         self._number += 1
         pins = head.get("pins")
-        pins = pins if pins and None not in pins else None
+        if pins and None in pins:
+            pins = None
         plan = head.pop("plan", None)
         ribbon: list[tuple[float, float, float, float]] = []
         if plan and "size" in head:
