@@ -27,7 +27,7 @@ from filelock import Timeout
 from rover_lib.onboard.artifact.acceptance import THIS_CAR, Expected, inspect_artifact
 from rover_lib.onboard.durable import sync
 from rover_lib.onboard.errors import RoverError, printable
-from rover_lib.onboard.stage import atomic_path, private_lock, sha256_of
+from rover_lib.onboard.stage import private_lock, sha256_of
 
 POLICY, ORIGIN = "policy.pt", "release.json"
 NAME = re.compile(r"[0-9a-f]{64}")
@@ -290,8 +290,12 @@ class Releases:
 
     def _write_history(self, names: list[str]) -> None:
         """Write the history, if there is room: a full disk must not prevent a rollback. The next command mends it."""
-        with contextlib.suppress(OSError), atomic_path(self.models / "history.json") as path:
-            path.write_text(json.dumps(names[-HISTORY:], indent=1) + "\n")
+        new = self.models / ".new-history"
+        with contextlib.suppress(OSError):
+            new.write_text(json.dumps(names[-HISTORY:], indent=1) + "\n")
+            sync(new)
+            new.replace(self.models / "history.json")
+            sync(self.models)
 
     def _by_use(self) -> list[str]:
         names = sorted(p.name for p in self.releases.glob("*") if NAME.fullmatch(p.name))
