@@ -30,9 +30,7 @@ def align(rows: Sequence[Sequence[str]]) -> list[str]:
 
 def number(value: float | None, form: str = ".1f") -> str:
     """A number in that form; a dash where nothing was measured."""
-    if value is None or not math.isfinite(value):
-        return "-"
-    return format(value, form)
+    return "-" if value is None or not math.isfinite(value) else format(value, form)
 
 
 def ratio(over: float | None, under: float | None) -> float | None:

@@ -75,9 +75,7 @@ def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Ite
             raise refused(path, f"its manifest says {manifest['mode']}, its code is not")
         for kind, why in expected.refusals(manifest).items():
             if kind not in allow:
-                remedy = "deploy another"
-                if kind in MAY_DIFFER:
-                    remedy += f", or allow it: {kind}"
+                remedy = f"deploy another, or allow it: {kind}" if kind in MAY_DIFFER else "deploy another"
                 raise ArtifactError(f"{path}: {why}", remedy=remedy)
         _ = artifact.parity  # has the shapes that the manifest says
     return artifact

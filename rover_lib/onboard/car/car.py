@@ -132,9 +132,7 @@ class Car:
         if self.positive != other.positive:
             return f"steering +1 turns {self.name!r} {self.positive} and {other.name!r} {other.positive}"
         mine, theirs = ((c.pulses_us, c.field_of_view_deg, c.wheelbase_m) for c in (self, other))
-        if mine != theirs:
-            return f"{self.name!r} and {other.name!r} differ in pulses, camera or wheelbase"
-        return ""
+        return "" if mine == theirs else f"{self.name!r} and {other.name!r} differ in pulses, camera or wheelbase"
 
     @property
     def pulses_us(self) -> tuple[int, ...]:

@@ -20,9 +20,7 @@ def other_ports(port: str, dev: Path = DEV) -> str:
     own = Path(port).resolve()
     ports = [f"{path} ({name})" if name else str(path) for path, name in list_ports(dev).items()]
     ports = [text for text in ports if text.split()[0] != str(own)]
-    if not ports:
-        return ""
-    return f"{own} was asked, and there is also {', '.join(ports)}: unplug it, or try --port"
+    return f"{own} was asked, and there is also {', '.join(ports)}: unplug it, or try --port" if ports else ""
 
 
 def find_port(dev: Path = DEV) -> str:

@@ -220,9 +220,7 @@ def floor_ms(gmac: float | None, mode: str) -> float | None:
     gmac: 10**9 multiply-accumulates of one inference. mode: an artifact's: `mixed` and `dynamic` count as INT8, a floor
     that they cannot reach.
     """
-    if gmac is None:
-        return None
-    return gmac / PI5_GMAC_PER_S["fp32" if mode == "fp32" else "int8"] * 1000
+    return None if gmac is None else gmac / PI5_GMAC_PER_S["fp32" if mode == "fp32" else "int8"] * 1000
 
 
 class _Run:

@@ -57,9 +57,7 @@ class Check:
 
     def __str__(self) -> str:
         line = f"{self.verdict:<8} {self.name:<{NAME_WIDTH}} {self.found}"
-        if self.remedy:
-            line += f"\n{'':{9 + NAME_WIDTH}} {self.remedy}"
-        return line
+        return f"{line}\n{'':{9 + NAME_WIDTH}} {self.remedy}" if self.remedy else line
 
 
 def warn_unless(fine: bool, name: str, found: str, remedy: str) -> Check:

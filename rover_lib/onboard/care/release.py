@@ -263,10 +263,7 @@ class Releases:
     def _tidy(self) -> None:
         ours = (*self.releases.glob(".new"), *self.releases.glob(".gone-*"), *self.models.glob(".new-*"))
         for path in ours:  # other files, such as a .git, stay
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path)
-            else:
-                path.unlink()
+            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
         history = self._history()
         if (current := self.current) in self._by_use() and history[-1:] != [current]:
             self._write_history([*history, current])  # a switch was interrupted before the history was written

@@ -94,9 +94,7 @@ def confine(limit_mb: float) -> str:
     add("clone3", REFUSE | errno.ENOSYS)  # its flags are in memory; the C library then takes clone
     failed = next((code for code in codes if code), 0) or library.seccomp_load(context)
     library.seccomp_release(context)
-    if failed:
-        return f"the kernel takes no filter of system calls ({os.strerror(-failed)})"
-    return ""
+    return f"the kernel takes no filter of system calls ({os.strerror(-failed)})" if failed else ""
 
 
 def forbid_opening() -> None:
