@@ -105,7 +105,8 @@ class CameraFeed:
 
     def __init__(self, path: Path | str, *pictures: bytes | np.ndarray, rate_hz: float = 30.0):
         self.written = 0
-        self._pipe, self._period_s = FramePipe(path), 1 / rate_hz
+        self._pipe = FramePipe(path)
+        self._period_s = 1 / rate_hz
         self._closing = threading.Event()
         self.show(*pictures)
         self._thread = threading.Thread(target=self._run, name=f"camera feed {path}", daemon=True)
@@ -157,7 +158,8 @@ class VirtualCar:
         """
         self._folder = Path(tempfile.mkdtemp(prefix="rover-car-"))
         self.camera = str(self._folder / "camera")
-        self._talking, self._answers = threading.Lock(), b""
+        self._talking = threading.Lock()
+        self._answers = b""
         options = {"seed": seed, "board": board, "folder": str(self._folder), "parent": os.getpid()}
         command = (sys.executable, "-m", "balloon_world.car", json.dumps(options))
         env = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}  # where the board's module is
@@ -207,14 +209,12 @@ class VirtualCar:
         return json.loads(line)
 
 
-# ---- what runs in the process
-
-
 class _Car:
     """A car that the pulses on a board's pins drive through one world after the other."""
 
     def __init__(self, board: Any, seed: int):
-        self._board, self._pwm = board, this_car().pwm
+        self._board = board
+        self._pwm = this_car().pwm
         self._action = dict(zip(("steering", "throttle"), NEUTRAL, strict=True))
         self._held_ticks = math.inf  # until the pins first ask for motion
         self.world = World(seed)
@@ -238,19 +238,22 @@ class _Car:
         if self.world.done:
             self.hits += self.world.hit
             self.trials += 1
-            self.world, self._held_ticks = World(self.world.seed + 1), round(HOLD_S * RATE_HZ)
+            self.world = World(self.world.seed + 1)
+            self._held_ticks = round(HOLD_S * RATE_HZ)
 
 
 def _run(car: _Car, pipe: FramePipe, parent: int) -> None:
     """Move the car and write frames at absolute deadlines, until the parent closes standard input or has ended."""
-    late, rng, due = 0, np.random.default_rng(), time.monotonic()
+    late = 0
+    rng = np.random.default_rng()
+    due = time.monotonic()
     # Standard input alone does not tell that the parent has ended: another child of it may hold the other end open.
     while os.getppid() == parent:
         while select.select([0], [], [], max(0.0, due - time.monotonic()))[0]:
-            asked = os.read(0, 4096)
-            if not asked:
+            request = os.read(0, 4096)
+            if not request:
                 return
-            for _ in range(asked.count(b"\n")):
+            for _ in range(request.count(b"\n")):
                 print(json.dumps({"hits": car.hits, "trials": car.trials, "camera_late": late}), flush=True)
         car.tick()
         if pipe.ready:  # what nobody would see is not drawn

@@ -35,9 +35,11 @@ class Child:
         name: for errors, such as 'the virtual car'. error: the class to raise. talks: by its standard input, whose end
         tells it to end, and output; otherwise it has neither, and SIGTERM tells it. env: further variables.
         """
-        self.name, self._error = name, error
+        self.name = name
+        self._error = error
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115, open until close()
-        words, stream = [str(part) for part in command], subprocess.PIPE if talks else subprocess.DEVNULL
+        words = [str(part) for part in command]
+        stream = subprocess.PIPE if talks else subprocess.DEVNULL
         streams: dict[str, Any] = {"stdin": stream, "stdout": stream, "stderr": self._errors, "bufsize": 0}
         self.process = subprocess.Popen(words, env={**os.environ, **(env or {})}, start_new_session=True, **streams)
         self.pid = self.process.pid
@@ -91,7 +93,8 @@ class Child:
         """Return the error that says how the process ended. Waits up to 5 s for that, if it is just about to."""
         if self._errors.closed:
             return self._error(f"{self.name} was closed", remedy="make a new one")
-        code, words = self.wait(STOP_S), last_words("\n".join(self.errors()))
+        code = self.wait(STOP_S)
+        words = last_words("\n".join(self.errors()))
         return self._error(f"{self.name} has ended (exit status {code}): {words}", remedy="start a new one")
 
     def close(self) -> None:

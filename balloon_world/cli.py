@@ -25,12 +25,12 @@ level_option = click.option(
 )
 
 
-def executed(notebook: str, run_dir: Path, stage: str, **given: Any) -> dict[str, Any]:
+def execute_stage(notebook: str, run_dir: Path, stage: str, **parameters: Any) -> dict[str, Any]:
     """Execute a notebook for a run, and return the stage that it has left."""
     from rover_lib.onboard.stage import read_stage
     from rover_lib.workshop.run.run import execute
 
-    execute(notebook, run_dir, **given)
+    execute(notebook, run_dir, **parameters)
     return read_stage(run_dir / f"{stage}.json", stage)
 
 
@@ -89,8 +89,8 @@ def students(teacher_run: Path, student_runs: tuple[Path, ...], worlds: int, lev
     """
     from balloon_world.students import table
 
-    given = {"students": [str(run.resolve()) for run in student_runs], "worlds": worlds, "level": level}
-    click.echo(table(executed("08_distill", teacher_run, "students", **given)["metrics"]))
+    parameters = {"students": [str(run.resolve()) for run in student_runs], "worlds": worlds, "level": level}
+    click.echo(table(execute_stage("08_distill", teacher_run, "students", **parameters)["metrics"]))
 
 
 @world.command(short_help="Drive, correct, learn: does it drive better?", cls=Resumable)
@@ -117,4 +117,4 @@ def learn(run_dir: Path, worlds: int, **options: Any) -> None:
     run_dir = run_dir.resolve()
     experiment = Experiment(worlds=worlds, other_worlds=max(1, worlds // 2), **options)
     run_experiment(run_dir, run_dir.with_name(f"{run_dir.name}-learn"), experiment, terminal_bar())
-    click.echo(table(executed("09_learn", run_dir, "learn")))
+    click.echo(table(execute_stage("09_learn", run_dir, "learn")))

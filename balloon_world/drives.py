@@ -42,7 +42,7 @@ Watch = Callable[[Order], bool]
 
 
 @dataclass(frozen=True)
-class Driven:
+class WorldDrive:
     """A drive through a world.
 
     outcome: a World's, 'stopped' if a plan became too old to drive by or a place was unfamiliar, or
@@ -75,15 +75,19 @@ class TimedCar:
     draws = False  # whether latest() shows the loop what is to be seen; if not, no car looks stuck
 
     def __init__(self, world: World, policy: Any, latency_s: float):
-        self.world, self.policy, self.stop = world, policy, threading.Event()
+        self.world = world
+        self.policy = policy
+        self.stop = threading.Event()
         self.command: Order | None = None
         self.plans: list[Plan] = []
-        self._latency_s, self._commanded = latency_s, Commanded()
-        self._tick, self._looked_at = 0, -1  # the present tick, and the tick of the last frame that was planned from
+        self._latency_s = latency_s
+        self._commanded = Commanded()
+        self._tick = 0
+        self._looked_at = -1  # the tick of the last frame that was planned from
         self._coming: Plan | None = None
         self._think(ROUNDING)
 
-    def drive(self, settings: Settings, log: Any, watch: Watch | None = None) -> Driven:
+    def drive(self, settings: Settings, log: Any, watch: Watch | None = None) -> WorldDrive:
         """Drive by the car's own loop until the world ends or `stop` is set."""
         settings = settings if self.draws else replace(settings, stuck_s=0.0)
         pilot = WorldPilot(self, self._commanded, settings, self.policy.rate_hz, watch)
@@ -92,8 +96,8 @@ class TimedCar:
         except DriveFault as fault:
             if fault.__cause__:  # the policy failed; without a cause, a plan had become too old
                 raise fault.__cause__ from None
-            return Driven("stopped", pilot.orders)
-        return Driven(self.world.outcome or "taken over", pilot.orders)
+            return WorldDrive("stopped", pilot.orders)
+        return WorldDrive(self.world.outcome or "taken over", pilot.orders)
 
     def clock(self) -> float:
         return self._tick / RATE_HZ
@@ -132,7 +136,8 @@ class TimedCar:
                 if self._coming.ready_s * RATE_HZ > until_tick:
                     return
                 self.plans.append(self._coming)
-                now_s, self._coming = max(now_s, self._coming.ready_s), None
+                now_s = max(now_s, self._coming.ready_s)
+                self._coming = None
             if self._looked_at == self._tick:
                 return  # the planner waits for another frame
             self._looked_at = self._tick
@@ -150,7 +155,8 @@ class WorldPilot(PolicyPilot):
         camera_and_planner: Any = car
         super().__init__(camera_and_planner, camera_and_planner, commanded, settings, rate_hz)
         self.orders: list[Order] = []
-        self._car, self._watch = car, watch
+        self._car = car
+        self._watch = watch
 
     def sent(self, at_s: float, order: Order) -> None:
         super().sent(at_s, order)
@@ -160,7 +166,7 @@ class WorldPilot(PolicyPilot):
             self._car.stop.set()  # the drive ends after this tick
 
 
-def drive_in(policy: Any, world: World, latency_s: float, settings: Settings, watch: Watch | None = None) -> Driven:
+def drive_in(policy: Any, world: World, latency_s: float, settings: Settings, watch: Watch | None = None) -> WorldDrive:
     """Drive through a world until it has ended.
 
     policy: an artifact's Policy, or anything else with `rate_hz` and `predict_unclipped`. latency_s: from taking the
@@ -175,10 +181,7 @@ def drive_in(policy: Any, world: World, latency_s: float, settings: Settings, wa
     return car.drive(replace(settings, unfamiliar=OFF), NoLog(), watch)
 
 
-# --- many drives ------------------------------------------------------------------------------------------------------
-
-
-def everywhere(artifact: Path, asked: Sequence[K], do: Callable[[Policy, K], V]) -> Iterator[tuple[K, V]]:
+def everywhere(artifact: Path, questions: Sequence[K], do: Callable[[Policy, K], V]) -> Iterator[tuple[K, V]]:
     """Call do(policy, question) for each question on a thread for each core; yield (question, answer) when ready.
 
     Each thread loads the policy for itself, to be run by that thread alone: once torch has a second thread, it spins
@@ -191,8 +194,8 @@ def everywhere(artifact: Path, asked: Sequence[K], do: Callable[[Policy, K], V])
             own.policy = load_policy(artifact, threads=1)
         return question, do(own.policy, question)
 
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, len(asked))) as pool:
-        running = [pool.submit(one, question) for question in asked]
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, len(questions))) as pool:
+        running = [pool.submit(one, question) for question in questions]
         try:
             for future in as_completed(running):
                 yield future.result()
@@ -218,7 +221,7 @@ def append_row(path: Path, row: dict[str, Any]) -> None:
 
 def drive_missing(
     artifact: Path,
-    asked: Sequence[tuple[str, int]],
+    questions: Sequence[tuple[str, int]],
     one: Callable[[Policy, tuple[str, int]], Mapping[str, Any]],
     path: Path,
     progress: Progress = silent,
@@ -228,14 +231,14 @@ def drive_missing(
 
     Rows that are in the file are not driven again, and each new one is there as soon as its drive has ended.
     """
-    kept = {(row["how"], row["seed"]): row for row in read_rows(path)}
-    missing = [each for each in asked if each not in kept]
+    rows = {(row["how"], row["seed"]): row for row in read_rows(path)}
+    missing = [question for question in questions if question not in rows]
     if missing:
-        driven = everywhere(artifact, missing, one)
-        for (how, seed), found in progress(driven, desc=desc, total=len(missing)):
-            kept[how, seed] = {"how": how, "seed": seed, **found}
-            append_row(path, kept[how, seed])
-    return {each: kept[each] for each in asked}
+        answers = everywhere(artifact, missing, one)
+        for (kind, seed), row in progress(answers, desc=desc, total=len(missing)):
+            rows[kind, seed] = {"how": kind, "seed": seed, **row}
+            append_row(path, rows[kind, seed])
+    return {question: rows[question] for question in questions}
 
 
 def count_hits(outcomes: Sequence[str], key: str = "hits_wilson") -> dict[str, Any]:
@@ -259,15 +262,12 @@ def judge(
     one: drives a policy in that way through the world of a seed. path: keeps what was driven, see `drive_missing`.
     """
 
-    def row(policy: Policy, asked: tuple[str, int]) -> dict[str, Any]:
-        return {"outcome": one(policy, *asked)}
+    def row(policy: Policy, question: tuple[str, int]) -> dict[str, Any]:
+        return {"outcome": one(policy, *question)}
 
-    asked = [(how, SEED + i) for how, count in worlds.items() for i in range(count)]
-    found = drive_missing(artifact, asked, row, path, progress, f"driving {name}")
-    return {how: [found[how, SEED + i]["outcome"] for i in range(count)] for how, count in worlds.items()}
-
-
-# --- trials, with plans that take no time -----------------------------------------------------------------------------
+    questions = [(kind, SEED + i) for kind, count in worlds.items() for i in range(count)]
+    rows = drive_missing(artifact, questions, row, path, progress, f"driving {name}")
+    return {kind: [rows[kind, SEED + i]["outcome"] for i in range(count)] for kind, count in worlds.items()}
 
 
 @dataclass(frozen=True)
@@ -310,14 +310,16 @@ def run_trials(
     Raises TrainingError for parameters outside their ranges, and plans of a wrong shape or that are not finite.
     """
     if worlds < 1 or not 1 <= replan_every <= policy.chunk:
-        what = f"trials need at least 1 world, and replan_every from 1 to {policy.chunk}"
-        raise TrainingError(what, found=f"{worlds} and {replan_every}")
+        problem = f"trials need at least 1 world, and replan_every from 1 to {policy.chunk}"
+        raise TrainingError(problem, found=f"{worlds} and {replan_every}")
     car = getattr(policy, "car", None)
-    left = car.left if isinstance(car, Car) else None  # of older recordings, whose car turned left
+    side = car.left if isinstance(car, Car) else None  # of older recordings, whose car turned left
     seeds = progress(range(seed, seed + worlds), desc="driving", total=worlds)
-    hit, paths, balloons = list[bool](), list[np.ndarray](), list[tuple[float, float]]()
+    hit = list[bool]()
+    paths = list[np.ndarray]()
+    balloons = list[tuple[float, float]]()
     for world_seed in seeds:
-        world = World(world_seed, left=left, level=level)
+        world = World(world_seed, left=side, level=level)
         _drive_to_end(policy, world, replan_every)
         hit.append(world.hit)
         paths.append(path_of(world))
@@ -342,8 +344,8 @@ def _drive_to_end(policy: Any, world: World, replan_every: int) -> None:
     while not world.done:
         chunk = np.asarray(policy.predict_chunk(world.render(), state))
         if chunk.ndim != 2 or chunk.shape[0] < replan_every or chunk.shape[1] != 2 or not np.isfinite(chunk).all():
-            found = f"{chunk.shape} in world {world.seed}"
-            raise TrainingError("the policy must plan finite (steps, 2) actions", found=found)
+            shape = f"{chunk.shape} in world {world.seed}"
+            raise TrainingError("the policy must plan finite (steps, 2) actions", found=shape)
         for steering, throttle in chunk[:replan_every]:
             world.step(float(np.clip(steering, -1, 1)), float(np.clip(throttle, 0, 1)))
             state = np.array([steering, throttle], np.float32)

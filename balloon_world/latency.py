@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from balloon_world.drives import SEED, Driven, count_hits, drive_in, everywhere, path_of
+from balloon_world.drives import SEED, WorldDrive, count_hits, drive_in, everywhere, path_of
 from balloon_world.level import EASY, level_named
 from balloon_world.world import World
 from rover_lib.onboard.artifact.manifest import content_hash
@@ -43,33 +43,36 @@ def measure_latencies(
     Raises TrainingError if there is no policy, no world, no latency or no such level.
     """
     of_level = level_named(level)
-    p, artifact = params(), Path(run_dir) / f"policy_{GATED}.pt"
+    p = params()
+    artifact = Path(run_dir) / f"policy_{GATED}.pt"
     if not artifact.is_file():
         raise TrainingError(f"{artifact}: not there", remedy="rover run makes it")
     if not latencies_ms or worlds < 1:
         raise TrainingError("drives need at least one latency and one world", found=f"{latencies_ms} and {worlds}")
-    given = {"worlds": worlds, "seed": SEED, "latencies_ms": latencies_ms, "pushes": pushes, "drive": p["drive"]}
+    parameters = {"worlds": worlds, "seed": SEED, "latencies_ms": latencies_ms, "pushes": pushes, "drive": p["drive"]}
     limit_pct = p["gates"]["worlds_lost_pct"]
-    given |= {"pushed_latencies_ms": pushed_latencies_ms, "limit_pct": limit_pct, "level": level}
+    parameters |= {"pushed_latencies_ms": pushed_latencies_ms, "limit_pct": limit_pct, "level": level}
     inputs = {artifact.name: content_hash(artifact)}  # unchanged if the same policy is exported again
-    settings, rows = Settings.of(p["drive"]), list[dict[str, Any]]()
+    settings = Settings.of(p["drive"])
+    rows = list[dict[str, Any]]()
     for ms, count in [(ms, 0) for ms in latencies_ms] + [(ms, pushes) for ms in pushed_latencies_ms]:
-        how = {"latency_ms": round(float(ms), 3), "pushes": count}
-        rows.append(how | {"compensate": True})
+        conditions = {"latency_ms": round(float(ms), 3), "pushes": count}
+        rows.append(conditions | {"compensate": True})
         if ms:  # a plan that takes no time leaves nothing to compensate
-            rows.append(how | {"compensate": False})
+            rows.append(conditions | {"compensate": False})
 
-    def one(policy: Any, asked: tuple[int, int]) -> Driven:
-        how, seed = rows[asked[0]], asked[1]
-        chosen = replace(settings, compensate=how["compensate"])
-        return drive_in(policy, World(seed, how["pushes"], level=of_level), how["latency_ms"] / 1e3, chosen)
+    def one(policy: Any, question: tuple[int, int]) -> WorldDrive:
+        row = rows[question[0]]
+        seed = question[1]
+        own_settings = replace(settings, compensate=row["compensate"])
+        return drive_in(policy, World(seed, row["pushes"], level=of_level), row["latency_ms"] / 1e3, own_settings)
 
-    asked = list(product(range(len(rows)), range(SEED, SEED + worlds)))
-    driven = dict(progress(everywhere(artifact, asked, one), desc="driving", total=len(asked)))
+    questions = list(product(range(len(rows)), range(SEED, SEED + worlds)))
+    drives = dict(progress(everywhere(artifact, questions, one), desc="driving", total=len(questions)))
     for i, row in enumerate(rows):
-        row |= _found([driven[i, seed] for seed in range(SEED, SEED + worlds)])
+        row |= _count_outcomes([drives[i, seed] for seed in range(SEED, SEED + worlds)])
     metrics = {"rows": rows, "gates": gates(rows, limit_pct)}
-    return write_stage(artifact.with_name("drive.json"), "drive", params=given, metrics=metrics, inputs=inputs)
+    return write_stage(artifact.with_name("drive.json"), "drive", params=parameters, metrics=metrics, inputs=inputs)
 
 
 @dataclass(frozen=True)
@@ -86,33 +89,35 @@ def pushed_on_map(
 ) -> dict[str, list[OnMap]]:
     """Drive some of the pushed drives of `measure_latencies` once more, compensated, for a map of each latency."""
     of_level = level_named(level)
-    policy, settings = load_policy(Path(run_dir) / f"policy_{GATED}.pt"), Settings.of(params()["drive"])
+    policy = load_policy(Path(run_dir) / f"policy_{GATED}.pt")
+    settings = Settings.of(params()["drive"])
     maps: dict[str, list[OnMap]] = {}
     for ms in latencies_ms:
         for seed in range(SEED, SEED + min(worlds, ON_A_MAP)):
             world = World(seed, pushes, level=of_level)
-            driven = drive_in(policy, world, ms / 1e3, settings)
-            found = OnMap(driven.outcome, path_of(world), (world.balloon.x_m, world.balloon.y_m))
-            maps.setdefault(f"{ms:g} ms late", []).append(found)
+            drive = drive_in(policy, world, ms / 1e3, settings)
+            on_map = OnMap(drive.outcome, path_of(world), (world.balloon.x_m, world.balloon.y_m))
+            maps.setdefault(f"{ms:g} ms late", []).append(on_map)
     return maps
 
 
-def _found(driven: Sequence[Driven]) -> dict[str, Any]:
+def _count_outcomes(drives: Sequence[WorldDrive]) -> dict[str, Any]:
     """Return what a row of drive.json says of its drives."""
-    outcomes = [d.outcome for d in driven]
-    found = count_hits(outcomes) | {
+    outcomes = [d.outcome for d in drives]
+    counts = count_hits(outcomes) | {
         outcome: outcomes.count(outcome) for outcome in ("left", "bumped", "timeout", "stopped")
     }
-    ages_ms = 1e3 * np.array([o.age_s for d in driven for o in d.orders])
+    ages_ms = 1e3 * np.array([o.age_s for d in drives for o in d.orders])
     for name, q in (("min", 0), ("p50", 50), ("p95", 95), ("max", 100)):
-        found[f"plan_age_{name}_ms"] = round(float(np.percentile(ages_ms, q)), 3) if len(ages_ms) else None
-    return found
+        counts[f"plan_age_{name}_ms"] = round(float(np.percentile(ages_ms, q)), 3) if len(ages_ms) else None
+    return counts
 
 
 def gates(rows: Sequence[Mapping[str, Any]], limit_pct: float) -> list[dict[str, Any]]:
     """Judge the worlds lost at 150 ms, compensated, against the same at 0 ms. rows: of drive.json."""
     missed = {r["latency_ms"]: r["missed"] for r in rows if r["compensate"] and not r["pushes"]}
-    pairs, worlds = None, rows[0]["trials"]
+    pairs = None
+    worlds = rows[0]["trials"]
     if {0.0, JUDGED_MS} <= set(missed):
         seeds = range(SEED, SEED + worlds)
         pairs = compare_pairs(*([seed not in missed[ms] for seed in seeds] for ms in (0.0, JUDGED_MS)))
@@ -123,8 +128,8 @@ def table(content: Mapping[str, Any]) -> Table:
     """Show the content of drive.json as a table."""
     rows = []
     for r in content["metrics"]["rows"]:
-        how = f"{r['pushes']} pushes" if r["pushes"] else "left alone"
-        how += "" if r["compensate"] else ", not compensated"
+        kind = f"{r['pushes']} pushes" if r["pushes"] else "left alone"
+        kind += "" if r["compensate"] else ", not compensated"
         age = "-" if r["plan_age_p95_ms"] is None else f"{r['plan_age_p95_ms']:.0f} ms"
-        rows.append((how, f"{r['latency_ms']:g} ms", age, f"{r['hits']} of {r['trials']}", str(r["stopped"])))
+        rows.append((kind, f"{r['latency_ms']:g} ms", age, f"{r['hits']} of {r['trials']}", str(r["stopped"])))
     return Table(("", "latency", "plan age, p95", "hits", "stopped"), rows)

@@ -45,7 +45,8 @@ FIRST_LEARNED = 2_000_000  # seeds of the worlds to learn in, far from those of 
 FIRST_DEMONSTRATED = 3_000_000
 FIRST_DRIVE = datetime(2025, 6, 1, 12, tzinfo=UTC)  # invented, so that a seed's recording always has the same bytes
 GATED_WORLDS = 40
-OFF, REACTS_S = 0.25, 0.4  # a share of full steering; when the human takes over
+OFF = 0.25  # a share of full steering
+REACTS_S = 0.4  # then the human takes over
 CHANCE = 0.05  # a difference counts if its sign test's p is below this
 HALF_A_TICK_S = 0.5 / RATE_HZ
 JUDGED_FRAMES = 2  # held-out frames of old episodes; two are enough, as worlds judge here
@@ -144,21 +145,23 @@ def run_experiment(
     run_dir: as `make demo` leaves it. out_dir: keeps what is recorded, learned and driven on the way, by experiment;
     after an end at any moment, the same call goes on from there. Raises TrainingError if the run lacks a file.
     """
-    run_dir, out_dir = Path(run_dir).resolve(), Path(out_dir).resolve()
+    run_dir = Path(run_dir).resolve()
+    out_dir = Path(out_dir).resolve()
     for name in (CHECKPOINT, EPISODES, ARTIFACT):
         if not (run_dir / name).exists():
             raise TrainingError(f"{run_dir / name}: not there", remedy="rover run makes it")
     inputs = {CHECKPOINT: sha256_of(run_dir / CHECKPOINT), ARTIFACT: content_hash(run_dir / ARTIFACT)}
-    how = {"drive": params()["drive"], "recipe": asdict(experiment.recipe()), "seed": SEED, **car_in_key()}
-    given = plain(asdict(experiment) | how)
-    learned = {name: value for name, value in given.items() if name not in JUDGING}  # more worlds may judge later
+    constants = {"drive": params()["drive"], "recipe": asdict(experiment.recipe()), "seed": SEED, **car_in_key()}
+    parameters = plain(asdict(experiment) | constants)
+    # More worlds may judge later.
+    key_parameters = {name: value for name, value in parameters.items() if name not in JUDGING}
     if experiment.level == EASY.name:
-        del learned["level"]  # what was learned before there were levels stays valid
-    lab = _Lab(experiment, run_dir, out_dir / key_of({"params": learned, "inputs": inputs}), progress)
+        del key_parameters["level"]  # what was learned before there were levels stays valid
+    lab = _Lab(experiment, run_dir, out_dir / key_of({"params": key_parameters, "inputs": inputs}), progress)
     rounds = [lab.round(number) for number in range(1, experiment.rounds + 1)]
     rows = lab.judge(rounds)
     metrics = {"rounds": rounds, "policies": rows, "gates": gates(rows)}
-    return write_stage(run_dir / "learn.json", "learn", params=given, metrics=metrics, inputs=inputs)
+    return write_stage(run_dir / "learn.json", "learn", params=parameters, metrics=metrics, inputs=inputs)
 
 
 @dataclass(frozen=True)
@@ -183,37 +186,43 @@ class _Lab:
         self._demonstrate(number, human_s)
         for arm in ARMS:
             if not self._learned(arm, number).is_file():
-                recorded = [self.folder / _name(arm, n) for n in range(1, number + 1)]
-                self._learn(arm, number, [folder for folder in recorded if any(folder.glob("episode_*"))])
+                folders = [self.folder / _name(arm, n) for n in range(1, number + 1)]
+                self._learn(arm, number, [folder for folder in folders if any(folder.glob("episode_*"))])
         counts = {"takeovers": sum(d["taken_over_s"] is not None for d in drives), "drives": len(drives)}
         counts["missed"] = sum(d["outcome"] != "hit" for d in drives)
         return {"round": number, "human_s": human_s, **counts}
 
-    def _learn(self, arm: str, number: int, recorded: Sequence[Path]) -> None:
+    def _learn(self, arm: str, number: int, recordings: Sequence[Path]) -> None:
         """Train the first checkpoint further on these recordings too, and make the artifact."""
-        target, runs_dir = self._learned(arm, number), self.folder / "learned"
+        target = self._learned(arm, number)
+        runs_dir = self.folder / "learned"
         if not (target.parent / "finetune.json").is_file():
-            episodes, recipe = [self.run_dir / EPISODES, *recorded], self.experiment.recipe()
-            how: dict[str, Any] = {"runs_dir": runs_dir, "recipe": recipe, "progress": self.progress}
-            finetune(self.run_dir / CHECKPOINT, episodes, _name(arm, number), machine=Machine.of("cpu"), **how)
-        learned = load(target.parent / CHECKPOINT, self.run_dir / EPISODES, self.progress)
-        make_artifact(learned, target, params(), progress=self.progress)
+            episodes = [self.run_dir / EPISODES, *recordings]
+            recipe = self.experiment.recipe()
+            options: dict[str, Any] = {"runs_dir": runs_dir, "recipe": recipe, "progress": self.progress}
+            finetune(self.run_dir / CHECKPOINT, episodes, _name(arm, number), machine=Machine.of("cpu"), **options)
+        run = load(target.parent / CHECKPOINT, self.run_dir / EPISODES, self.progress)
+        make_artifact(run, target, params(), progress=self.progress)
 
     def _drive(self, artifact: Path, number: int) -> list[dict[str, Any]]:
         """Record a round's missing drives with a human beside the track, and return the rows of all."""
-        folder, first = self.folder / _name(CORRECTED, number), 1000 * number
+        folder = self.folder / _name(CORRECTED, number)
+        first = 1000 * number
 
-        def one(policy: Policy, asked: tuple[str, int]) -> dict[str, Any]:
-            i = asked[1] - FIRST_LEARNED - first
-            return drive_corrected(policy, folder, first + i, self.experiment.learned_in(i, asked[1]), self.experiment)
+        def one(policy: Policy, question: tuple[str, int]) -> dict[str, Any]:
+            i = question[1] - FIRST_LEARNED - first
+            return drive_corrected(
+                policy, folder, first + i, self.experiment.learned_in(i, question[1]), self.experiment
+            )
 
-        asked = [(CORRECTED, FIRST_LEARNED + first + i) for i in range(self.experiment.drives)]
+        questions = [(CORRECTED, FIRST_LEARNED + first + i) for i in range(self.experiment.drives)]
         desc = f"driving, round {number}"
-        return list(drive_missing(artifact, asked, one, folder / DRIVES_FILE, self.progress, desc).values())
+        return list(drive_missing(artifact, questions, one, folder / DRIVES_FILE, self.progress, desc).values())
 
     def _demonstrate(self, number: int, left_s: float) -> None:
         """Record left_s seconds of whole drives by the expert, unless they are there; the last drive is cut."""
-        folder, index = self.folder / _name(DEMONSTRATED, number), 1000 * number
+        folder = self.folder / _name(DEMONSTRATED, number)
+        index = 1000 * number
         if folder.exists():
             return
         with build_folder(folder) as new:
@@ -226,20 +235,20 @@ class _Lab:
         """Drive every policy through the worlds that judge, as far as missing, and return the rows of learn.json."""
         experiment = self.experiment
 
-        def one(policy: Policy, how: str, seed: int) -> str:
-            world = experiment.world(seed, experiment.pushes * (how == PUSHED), experiment.decoys * (how == DECOY))
+        def one(policy: Policy, kind: str, seed: int) -> str:
+            world = experiment.world(seed, experiment.pushes * (kind == PUSHED), experiment.decoys * (kind == DECOY))
             return experiment.drive(policy, world)
 
-        counts = {how: experiment.worlds if how == PUSHED else experiment.other_worlds for how in HOW}
-        learned = [(arm, number, self._learned(arm, number)) for arm in ARMS for number in range(1, len(rounds) + 1)]
+        counts = {kind: experiment.worlds if kind == PUSHED else experiment.other_worlds for kind in HOW}
+        artifacts = [(arm, number, self._learned(arm, number)) for arm in ARMS for number in range(1, len(rounds) + 1)]
         rows = []
-        for arm, number, artifact in [(BEFORE, 0, self.run_dir / ARTIFACT), *learned]:
+        for arm, number, artifact in [(BEFORE, 0, self.run_dir / ARTIFACT), *artifacts]:
             name = _name(arm, number) if number else BEFORE
-            found = judge(artifact, counts, one, self.folder / f"{name}.jsonl", self.progress, name)
+            outcomes_by_kind = judge(artifact, counts, one, self.folder / f"{name}.jsonl", self.progress, name)
             human_s = float(sum(r["human_s"] for r in rounds[:number]))
             row: dict[str, Any] = {"name": name, "arm": arm, "round": number, "human_s": human_s}
-            for how, outcomes in found.items():
-                row[how] = count_hits(outcomes, key="wilson")
+            for kind, outcomes in outcomes_by_kind.items():
+                row[kind] = count_hits(outcomes, key="wilson")
             rows.append(row)
         return rows
 
@@ -256,9 +265,6 @@ def _anew(folder: Path, index: int, world: World) -> WorldEpisode:
     return WorldEpisode(folder, start, world)
 
 
-# --- the results ------------------------------------------------------------------------------------------------------
-
-
 def _hits_of_40(drives: Mapping[str, Any]) -> int | None:
     """Return how many of the first GATED_WORLDS worlds were hit; None if not all of them were driven."""
     missed = sum(seed < SEED + GATED_WORLDS for seed in drives["missed"])
@@ -270,12 +276,12 @@ def gates(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     last, other = ([row for row in rows if row["arm"] == arm][-1] for arm in ARMS)
     pushed, alone, before = (_hits_of_40(drives) for drives in (last[PUSHED], last[ALONE], rows[0][ALONE]))
     lost = None if alone is None or before is None else before - alone
-    missed, others_missed = ({*row[PUSHED]["missed"]} for row in (last, other))
-    p = sign_test(len(others_missed - missed), len(missed - others_missed))
+    misses, other_misses = ({*row[PUSHED]["missed"]} for row in (last, other))
+    p = sign_test(len(other_misses - misses), len(misses - other_misses))
     by_chance = p if last[PUSHED]["hits"] > other[PUSHED]["hits"] else 1.0
-    least = params()["gates"]["corrected_hits"]
+    least_hits = params()["gates"]["corrected_hits"]
     return [
-        gate(f"hits of {GATED_WORLDS} when pushed, corrected", pushed, ">=", least),
+        gate(f"hits of {GATED_WORLDS} when pushed, corrected", pushed, ">=", least_hits),
         gate(f"hits of {GATED_WORLDS} lost when left alone", lost, "<=", 0),
         gate("chance that demonstrations do as well when pushed, by a sign test", by_chance, "<=", CHANCE),
     ]
@@ -285,8 +291,8 @@ def table(content: Mapping[str, Any]) -> Table:
     """Show the policies of learn.json as a table."""
     rows = []
     for row in content["metrics"]["policies"]:
-        counted = [row[how] for how in HOW]
-        hits = [f"{c['hits']} of {c['trials']} ({c['wilson_low']:.0%} to {c['wilson_high']:.0%})" for c in counted]
+        counts = [row[kind] for kind in HOW]
+        hits = [f"{c['hits']} of {c['trials']} ({c['wilson_low']:.0%} to {c['wilson_high']:.0%})" for c in counts]
         name = row["name"] if row["arm"] == BEFORE else f"{row['arm']}, round {row['round']}"
         rows.append((name, f"{row['human_s']:.0f}", *hits))
     return Table(("", "human s", *HOW.values()), rows, notes=["hits, with Wilson's 95 % interval"])

@@ -47,7 +47,8 @@ def record_episodes(
     Returns out_dir. On one machine the same count and seed give the same bytes.
     Raises TrainingError for a negative seed, or an out_dir with something else in it.
     """
-    out_dir, names = Path(out_dir), {episode_name(_start_of(index, seed)) for index in range(count)}
+    out_dir = Path(out_dir)
+    names = {episode_name(_start_of(index, seed)) for index in range(count)}
     made_of = {"count": count, "seed": seed, "jpeg_quality": JPEG_QUALITY, "cv2": cv2.__version__}
     made_of |= {"shoves": SHOVES[level], "car": this_car().description(), **level_in_key(level)}
     key = key_of(made_of, world_module, recording, pwm_module, sys.modules[__name__])
@@ -108,11 +109,15 @@ class WorldEpisode:
 
     def __init__(self, folder: Path, start: datetime, world: World):
         car = this_car()
-        self._world, self._pwm, self._start_s = world, car.pwm, start.timestamp()
+        self._world = world
+        self._pwm = car.pwm
+        self._start_s = start.timestamp()
         self._periods = [_round_us(c.period_us) for c in (self._pwm.steering, self._pwm.throttle)]
-        about = About(LABEL, fps=RATE_HZ, start_time_s=self._start_s, arduino_port=PORT, car=car)
+        description = About(LABEL, fps=RATE_HZ, start_time_s=self._start_s, arduino_port=PORT, car=car)
         size = FRAME_WIDTH, FRAME_HEIGHT
-        self.writer = EpisodeWriter(folder / episode_name(start), about, resolution=size, jpeg_quality=JPEG_QUALITY)
+        self.writer = EpisodeWriter(
+            folder / episode_name(start), description, resolution=size, jpeg_quality=JPEG_QUALITY
+        )
         self.writer.metadata["steering_positive"] = car.positive
 
     def __enter__(self) -> "WorldEpisode":
@@ -130,10 +135,10 @@ class WorldEpisode:
         t_s = self._world.state.time_s
         self.writer.frame(self._start_s + t_s, self._world.render())
         pulses = self._pwm.pulses(steering, throttle)
-        measured = _round_us(pulses.steering_us), _round_us(pulses.throttle_us)
+        pulses_us = _round_us(pulses.steering_us), _round_us(pulses.throttle_us)
         at_s = self._start_s + t_s + CONTROL_LATENCY_S
-        self.writer.control(at_s, round(1000 * t_s), *measured, *self._periods, **extra)
-        sent_steering, sent_throttle = self._pwm.actions(*measured, *self._periods)
+        self.writer.control(at_s, round(1000 * t_s), *pulses_us, *self._periods, **extra)
+        sent_steering, sent_throttle = self._pwm.actions(*pulses_us, *self._periods)
         assert sent_steering is not None and sent_throttle is not None, "what is commanded is measurable"
         return sent_steering, sent_throttle
 

@@ -64,8 +64,8 @@ class Simulation:
         artifact = Path(artifact)
         self._title = title or artifact.parent.name
         suffix = ONNX_SUFFIX if artifact.name.endswith(ONNX_SUFFIX) else artifact.suffix
-        beside = {mode: artifact.with_name(f"policy_{mode}{suffix}") for mode in MODES}
-        self._paths = {MODES[mode]: path for mode, path in beside.items() if path.is_file()}
+        paths = {mode: artifact.with_name(f"policy_{mode}{suffix}") for mode in MODES}
+        self._paths = {MODES[mode]: path for mode, path in paths.items() if path.is_file()}
         if artifact not in self._paths.values():
             self._paths = {artifact.name: artifact}
         self._wanted = next(name for name, path in self._paths.items() if path == artifact)
@@ -77,21 +77,24 @@ class Simulation:
         self._pushed = {name: [0, 0] for name in LEVELS}
         self._seed = SEED
         cv2.setNumThreads(THREADS)
-        self._closing, self._next, self._held = threading.Event(), threading.Event(), False
+        self._closing = threading.Event()
+        self._next = threading.Event()
+        self._held = False
         self._driving: PacedCar | None = None
 
     async def show(self, view: "View") -> None:
         """Drive in a thread until this is cancelled. While the view has not taken a picture, no other one follows."""
-        loop, taken = asyncio.get_running_loop(), threading.Event()
-        taken.set()
+        loop = asyncio.get_running_loop()
+        ready = threading.Event()
+        ready.set()
 
         def give(head: dict[str, Any], picture: bytes) -> None:
             view.show(head, picture)
-            taken.set()
+            ready.set()
 
         def post(head: dict[str, Any], picture: bytes) -> None:
-            if taken.is_set() and not self._closing.is_set():
-                taken.clear()
+            if ready.is_set() and not self._closing.is_set():
+                ready.clear()
                 with contextlib.suppress(RuntimeError):  # the view has just ended
                     loop.call_soon_threadsafe(give, head, picture)
 
@@ -101,46 +104,48 @@ class Simulation:
             self._closing.set()
             self.ask("stop")
 
-    def ask(self, what: str) -> None:
+    def ask(self, request: str) -> None:
         """Do what the page asks for, and ignore all else.
 
         That is "stop", "next", a push, "drive <name>" of another mode, or "level <name>".
         """
-        if what in SIDES:
+        if request in SIDES:
             if self._driving:
-                self._driving.push(SIDES[what])
+                self._driving.push(SIDES[request])
             return
-        name = what.removeprefix("drive ")
-        level = what.removeprefix("level ")
-        if what != "stop" and what != "next" and name not in self._paths and level not in LEVELS:
+        name = request.removeprefix("drive ")
+        level = request.removeprefix("level ")
+        if request != "stop" and request != "next" and name not in self._paths and level not in LEVELS:
             return
-        self._held = what == "stop"
+        self._held = request == "stop"
         if name in self._paths:
             self._wanted = name
         if level in LEVELS:
             self._level = LEVELS[level]
         if self._driving:
-            self._seed += what == "next" and not self._driving.world.done  # another policy gets the same world
+            self._seed += request == "next" and not self._driving.world.done  # another policy gets the same world
             self._driving.stop.set()
-        if what != "stop":
+        if request != "stop":
             self._next.set()
 
     def run(self, post: Post, worlds: int | None = None) -> None:
         """Drive through `worlds` worlds, None: until the view has ended. post: takes each picture."""
-        settings, driven = Settings.of(params()["drive"]), 0
-        while not self._closing.is_set() and driven != worlds:
-            name, level = self._wanted, self._level
+        settings = Settings.of(params()["drive"])
+        count = 0
+        while not self._closing.is_set() and count != worlds:
+            name = self._wanted
+            level = self._level
             if name not in self._policies:
                 self._policies[name] = load_policy(self._paths[name], threads=THREADS)
             world = World(self._seed, left=self.car.left, level=level)  # as in run_trials: older recordings turned left
             car = self._driving = PacedCar(world, self._policies[name], lambda car: post(*self._seen(car)))
             self._next.clear()
             outcome = car.drive(settings, car.log).outcome
-            driven += 1
+            count += 1
             if car.world.done or not car.stop.is_set():  # what somebody interrupted counts for nobody
-                counted = self._pushed[level.name] if car.pushes else self._results[level.name][name]
-                counted[0] += car.world.hit
-                counted[1] += 1
+                result = self._pushed[level.name] if car.pushes else self._results[level.name][name]
+                result[0] += car.world.hit
+                result[1] += 1
                 self._seed += 1
             self._wait(car, outcome, post)
 
@@ -158,7 +163,10 @@ class Simulation:
 
     def _seen(self, car: "PacedCar") -> tuple[dict[str, Any], bytes]:
         """What the page shows of a car now: a message as in feed.py, with `world` for what only a simulation knows."""
-        world, row, plan, frame = car.world, car.log.row, car.newest(), car.world.render()
+        world = car.world
+        row = car.log.row
+        plan = car.newest()
+        frame = car.world.render()
         head: dict[str, Any] = {
             "phase": "driving", "text": "", "title": f"{self._title}: {self._wanted}, balloon world",
             "sent_s": car.clock(), "missing": "", "who": "A", "why": "simulated", "events": [], "machine": {},
@@ -183,10 +191,12 @@ class Simulation:
 
 
 class PacedCar(TimedCar):
-    """A car in a world whose time goes as fast as the clock, or slower. seen: called for each picture to be shown."""
+    """A car in a world whose time goes as fast as the clock, or slower. show: called for each picture to be shown."""
 
-    def __init__(self, world: World, policy: Any, seen: Callable[["PacedCar"], object]):
-        self.log, self._seen, self.pushes = NoLog(), seen, 0
+    def __init__(self, world: World, policy: Any, show: Callable[["PacedCar"], object]):
+        self.log = NoLog()
+        self._show = show
+        self.pushes = 0
         self._due_s = self._shown_s = time.monotonic()
         super().__init__(world, policy, PLAN_S)
 
@@ -208,4 +218,4 @@ class PacedCar(TimedCar):
         # every second tick at most: where time is slow already, pictures in between would make it slower still
         if now_s - self._shown_s >= PICTURE_S and round(self.clock() * RATE_HZ) % 2 == 0:
             self._shown_s = now_s
-            self._seen(self)
+            self._show(self)

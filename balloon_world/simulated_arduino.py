@@ -106,7 +106,8 @@ class StandIn:
         while not self._closing.is_set():
             wait_s = min(max(self._status_due - time.monotonic(), 0.0), STATUS_S)
             events = dict(poller.poll(wait_s * 1000)).get(self._master, 0)
-            was_open, is_open = is_open, not events & select.POLLHUP
+            was_open = is_open
+            is_open = not events & select.POLLHUP
             if self._state == "A" and time.monotonic() - self._commanded >= TIMEOUT_S:
                 self._enter("S", "t")
             if not is_open:
@@ -160,7 +161,8 @@ class StandIn:
         if boot != self._boot or sequence <= self._sequence:
             self._result = "o"
         else:
-            self._sequence, self._result = sequence, self._obey(kind, numbers)
+            self._sequence = sequence
+            self._result = self._obey(kind, numbers)
         self._status()
 
     def _obey(self, kind: str, numbers: Sequence[int]) -> str:

@@ -59,7 +59,8 @@ class _Run:
     @classmethod
     def read(cls, folder: Path, name: str, shape: Mapping[str, Any]) -> "_Run":
         """Read a run's folder. shape: its row of distill.json."""
-        artifact, counts = folder / ARTIFACT, dict[str, Any]()
+        artifact = folder / ARTIFACT
+        counts = dict[str, Any]()
         manifest = read_manifest(artifact)
         if (folder / "arm.json").is_file():
             arm = read_stage(folder / "arm.json", "arm")
@@ -93,19 +94,22 @@ def judge_students(
     Raises TrainingError for runs that do not belong together, RoverError and ArtifactError for a missing file.
     """
     of_level = level_named(level)
-    folder, p = Path(run_dir).resolve(), params()
+    folder = Path(run_dir).resolve()
+    p = params()
     runs = _runs(folder, [Path(student).resolve() for student in students])
     source = Source.loaded(read_stage(folder / "load.json", "load")["params"], episodes)
     recordings = load_recordings(source, runs[0].manifest["chunk"], p["calibration"]["sync_s"], progress)
     parts = split(recordings, p["calibration"]["held_out_share"], p["calibration"]["seed"])
     samples = pick_evenly(parts.held_out, held_out_frames)
-    taught = _plans(folder / "policy_fp32.pt", f"{TEACHER} in float", samples, progress)
-    counted = runs[0].row["computed_ms"] is not None
+    teacher_plans = _plans(folder / "policy_fp32.pt", f"{TEACHER} in float", samples, progress)
+    is_counted = runs[0].row["computed_ms"] is not None
     rows = []
     for run in runs:
         plans = _plans(run.artifact, run.name, samples, progress)
-        pushed_ms = (run.row["computed_ms"] or (None, None))[1] if counted else 1e3 * run.manifest["gmac"] / GMAC_PER_S
-        row = run.row | errors_of(plans, taught, samples, recordings.action_range())
+        pushed_ms = 1e3 * run.manifest["gmac"] / GMAC_PER_S
+        if is_counted:
+            pushed_ms = (run.row["computed_ms"] or (None, None))[1]
+        row = run.row | errors_of(plans, teacher_plans, samples, recordings.action_range())
         rows.append(row | _drives(run, worlds, pushed_ms, of_level, progress))
     metrics = {
         "students": rows,
@@ -114,12 +118,12 @@ def judge_students(
         "judged_frames": len(samples),
         "held_out_episodes": parts.episodes["held_out"],
         "warnings": not_judged(recordings.action_range()),
-        "notes": [COUNTED if counted else ESTIMATED] if worlds else [NOBODY_DROVE],
+        "notes": [COUNTED if is_counted else ESTIMATED] if worlds else [NOBODY_DROVE],
     }
-    how = {"worlds": worlds, "level": level, "seed": SEED, "pushes": PUSHES, "drive": p["drive"]}
-    how["students"] = [run.name for run in runs[1:]]
+    parameters = {"worlds": worlds, "level": level, "seed": SEED, "pushes": PUSHES, "drive": p["drive"]}
+    parameters["students"] = [run.name for run in runs[1:]]
     inputs = {f"{run.name}/{ARTIFACT}": sha256_of(run.artifact) for run in runs}
-    return write_stage(folder / "students.json", "students", params=how, metrics=metrics, inputs=inputs)
+    return write_stage(folder / "students.json", "students", params=parameters, metrics=metrics, inputs=inputs)
 
 
 def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
@@ -129,14 +133,17 @@ def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
         raise TrainingError(f"students must have names of their own, and none is '{TEACHER}'", found=names)
     runs: list[_Run] = []
     for student in students:
-        taught = read_stage(student / "distill.json", "distill")
-        of_teacher, own = taught["metrics"]["students"]
+        distillation = read_stage(student / "distill.json", "distill")
+        of_teacher, own = distillation["metrics"]["students"]
         runs = runs or [_Run.read(folder, TEACHER, of_teacher)]
         runs.append(_Run.read(student, student.name, own))
-        teacher, made = (run.manifest["checkpoint"]["sha256"] for run in (runs[0], runs[-1]))
-        if teacher not in taught["inputs"].values() or made not in taught["metrics"]["files_sha256"].values():
-            what = f"{student / ARTIFACT}: its checkpoint is not the student, or {folder / ARTIFACT} not its teacher's"
-            raise TrainingError(what, remedy="'rover run' makes artifacts anew")
+        teacher_sha256, student_sha256 = (run.manifest["checkpoint"]["sha256"] for run in (runs[0], runs[-1]))
+        files_sha256 = distillation["metrics"]["files_sha256"].values()
+        if teacher_sha256 not in distillation["inputs"].values() or student_sha256 not in files_sha256:
+            problem = (
+                f"{student / ARTIFACT}: its checkpoint is not the student, or {folder / ARTIFACT} not its teacher's"
+            )
+            raise TrainingError(problem, remedy="'rover run' makes artifacts anew")
     return runs
 
 
@@ -146,30 +153,27 @@ def _plans(artifact: Path, name: str, samples: Sequence[Sample], progress: Progr
     def one(policy: Policy, i: int) -> np.ndarray:
         return policy.predict_chunk(samples[i].frame_bgr(), samples[i].state)
 
-    every = everywhere(artifact, range(len(samples)), one)
-    planned = dict(progress(every, desc=f"judging {name}", total=len(samples)))
-    return np.stack([planned[i] for i in range(len(samples))])
-
-
-# --- in worlds --------------------------------------------------------------------------------------------------------
+    answers = everywhere(artifact, range(len(samples)), one)
+    plans = dict(progress(answers, desc=f"judging {name}", total=len(samples)))
+    return np.stack([plans[i] for i in range(len(samples))])
 
 
 def _drives(run: _Run, worlds: int, pushed_ms: float | None, level: Level, progress: Progress) -> dict[str, Any]:
     """Return a row's hits, left alone and pushed; all None if nobody drove. pushed_ms: None if it is not known."""
-    how = params()["drive"]
+    section = params()["drive"]
 
     def one(policy: Policy, kind: str, seed: int) -> str:
-        return drive_once(policy, seed, pushed_ms if kind else None, Settings.of(how), level)
+        return drive_once(policy, seed, pushed_ms if kind else None, Settings.of(section), level)
 
-    driven_by = {"artifact": content_hash(run.artifact), "torch": torch.__version__, **car_in_key()}
-    driven_by |= {"drive": how, "pushes": PUSHES, "late": pushed_ms, **level_in_key(level)}
-    path = cache_root() / f"drives-{key_of(driven_by, world, drives, loop, pilot, plan)}.jsonl"
+    key_parameters = {"artifact": content_hash(run.artifact), "torch": torch.__version__, **car_in_key()}
+    key_parameters |= {"drive": section, "pushes": PUSHES, "late": pushed_ms, **level_in_key(level)}
+    path = cache_root() / f"drives-{key_of(key_parameters, world, drives, loop, pilot, plan)}.jsonl"
     counts = {kind: worlds for kind in HOW if worlds and not (kind and pushed_ms is None)}
-    found = judge(run.artifact, counts, one, path, progress, run.name)
+    outcomes = judge(run.artifact, counts, one, path, progress, run.name)
     row: dict[str, Any] = {"pushed_latency_ms": pushed_ms if worlds else None}
     for kind in HOW:
-        counted = count_hits(found[kind]) if kind in found else dict.fromkeys(COUNTS)
-        row |= {f"{kind}{name}": value for name, value in counted.items()}
+        hits = count_hits(outcomes[kind]) if kind in outcomes else dict.fromkeys(COUNTS)
+        row |= {f"{kind}{name}": value for name, value in hits.items()}
     return row
 
 
@@ -180,19 +184,16 @@ def drive_once(policy: Policy, seed: int, late_ms: float | None, settings: Setti
     return drive_in(policy, World(seed, PUSHES, level=level), late_ms / 1e3, settings).outcome
 
 
-# --- the rule ---------------------------------------------------------------------------------------------------------
-
-
 def gates_of(row: Mapping[str, Any], teacher: Mapping[str, Any], limits: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Hold a student to the rule; return rows of `compare.gate`. limits: params.yml's section `students`.
 
     Drives are judged only if the teacher drove. Then a kind of drive that is missing neither passes nor fails.
     """
     rows = []
-    for kind, how in HOW.items() if teacher["trials"] else ():
-        hits, trials = (teacher[f"{kind}{what}"] for what in ("hits", "trials"))
+    for kind, words in HOW.items() if teacher["trials"] else ():
+        hits, trials = (teacher[f"{kind}{count}"] for count in ("hits", "trials"))
         lost = 100 * (hits - row[f"{kind}hits"]) / trials if trials and row[f"{kind}trials"] else None
-        rows.append(gate(f"{row['name']} worlds lost, {how}, %", lost, "<=", limits[f"{kind}worlds_lost_pct"]))
+        rows.append(gate(f"{row['name']} worlds lost, {words}, %", lost, "<=", limits[f"{kind}worlds_lost_pct"]))
     keys = [key for key in row if key.startswith("recorded_") and None not in (row[key], teacher[key])]
     above = worst(row[key] - teacher[key] for key in keys)
     return [*rows, gate(f"{row['name']} error to the recordings, points above", above, "<=", limits["recorded_points"])]
@@ -206,8 +207,8 @@ def recommendation(rows: Sequence[Mapping[str, Any]], limits: Mapping[str, Any])
     teacher, *students = rows
     gates = {row["name"]: gates_of(row, teacher, limits) for row in students}
     key = "gmac" if any(row["instructions_g"] is None for row in rows) else "instructions_g"
-    passed = [row for row in students if all(g["passed"] for g in gates[row["name"]])]
-    fastest = min(passed, key=lambda row: row[key], default=teacher)
+    passing = [row for row in students if all(g["passed"] for g in gates[row["name"]])]
+    fastest = min(passing, key=lambda row: row[key], default=teacher)
     return {"name": fastest["name"], "fastest_by": key, "gates": [g for its_gates in gates.values() for g in its_gates]}
 
 
@@ -217,19 +218,19 @@ def table(metrics: Mapping[str, Any]) -> Table:
     actions = [key.removeprefix("teacher_").removesuffix("_pct") for key in teacher if key.startswith("teacher_")]
     rows = []
     for row in metrics["students"]:
-        counted = "-" if row["instructions_g"] is None else f"{row['instructions_g']:.3g}"
+        instructions = "-" if row["instructions_g"] is None else f"{row['instructions_g']:.3g}"
         span = "not counted" if row["computed_ms"] is None else "{:.3g} to {:.3g}".format(*row["computed_ms"])
         pushed = _hits(row, "pushed_") + (f" at {row['pushed_latency_ms']:.0f} ms" if row["pushed_trials"] else "")
         errors = []
         for to in ("teacher", "recorded"):
-            each = [format_pct(row[f"{to}_{action}_pct"]).strip().removesuffix(" %") for action in actions]
-            errors.append(" / ".join(each))
-        work = (f"{row['size_mb']:.1f}", f"{row['gmac']:.3g}", counted, span)
+            errors_pct = [format_pct(row[f"{to}_{action}_pct"]).strip().removesuffix(" %") for action in actions]
+            errors.append(" / ".join(errors_pct))
+        work = (f"{row['size_mb']:.1f}", f"{row['gmac']:.3g}", instructions, span)
         rows.append((f"{row['name']}: {shape_of(row)}", *work, _hits(row, ""), pushed, *errors))
-    what = f"errors in {' / '.join(actions)}, of the static INT8 artifact, % of the recorded range"
+    error_note = f"errors in {' / '.join(actions)}, of the static INT8 artifact, % of the recorded range"
     header = ("", "MB", "GMAC", "10^9 instructions", "ms, computed", "left alone", "pushed")
-    chosen = f"recommended by the limits of params.yml: {metrics['recommendation']['name']}"
-    notes = (chosen, what, *metrics["notes"], *metrics["warnings"])
+    recommended = f"recommended by the limits of params.yml: {metrics['recommendation']['name']}"
+    notes = (recommended, error_note, *metrics["notes"], *metrics["warnings"])
     return Table((*header, "to the teacher, %", "to the recordings, %"), rows, notes=notes)
 
 

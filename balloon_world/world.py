@@ -33,7 +33,8 @@ SPEED_PER_THROTTLE_MPS = 12.0
 SPEED_LAG_S = 0.2
 
 # The expert.
-STEERING_MOST, STEERING_MOST_AROUND = 0.65, 0.9  # to the balloon, and where something may be in the way
+STEERING_MOST = 0.65  # to the balloon
+STEERING_MOST_AROUND = 0.9  # where something may be in the way
 THROTTLE_MOST = 0.09
 THROTTLE_RISE_PER_S = 0.20  # from a stand to full in half a second
 THROTTLE_FALL_PER_S = 0.30
@@ -150,7 +151,7 @@ class World:
         self._gain = rng.uniform(*level.gain)
         self._flicker = rng.uniform(0.0, level.flicker), rng.uniform(*level.flicker_hz), rng.uniform(0, 2 * math.pi)
         self._speed, self._steering, self._slip_s = (
-            more.uniform(*each) for each in (level.speed, level.steering, level.slip_s)
+            more.uniform(*span) for span in (level.speed, level.steering, level.slip_s)
         )
         if alike:
             _paint_red(more, self._floor, self._far_floor, self._wall)
@@ -173,17 +174,17 @@ class World:
 
     def step(self, steering: float, throttle: float, dt: float = 1 / RATE_HZ) -> None:
         """Drive for dt seconds. Raises TrainingError for an action outside its range, or if the drive has ended."""
-        (_, least), _ = _CAR.limits
-        if not (-1 <= steering <= 1 and least <= throttle <= 1):
+        (_, lowest), _ = _CAR.limits
+        if not (-1 <= steering <= 1 and lowest <= throttle <= 1):
             raise TrainingError(
-                f"steering must be in [-1, 1] and throttle in [{least:g}, 1]", found=(steering, throttle)
+                f"steering must be in [-1, 1] and throttle in [{lowest:g}, 1]", found=(steering, throttle)
             )
         if self.done:
             raise TrainingError(f"world {self.seed} has ended ({self.outcome})", remedy="make a new one")
         s = self.state
         wheels = s.steering + (steering - s.steering) * (1 - math.exp(-dt / STEERING_LAG_S))
-        wanted = throttle * SPEED_PER_THROTTLE_MPS * self._speed
-        speed = s.speed_mps + (wanted - s.speed_mps) * (1 - math.exp(-dt / SPEED_LAG_S))
+        target_mps = throttle * SPEED_PER_THROTTLE_MPS * self._speed
+        speed = s.speed_mps + (target_mps - s.speed_mps) * (1 - math.exp(-dt / SPEED_LAG_S))
         yaw_rps = speed / WHEELBASE_M * math.tan(self.left * wheels * WHEEL_ANGLE_RAD) * self._steering
         sideways_mps = -self._slip_s * speed * yaw_rps  # outwards, as the tyres slip
         for shove in self._shoves:
@@ -219,8 +220,8 @@ class World:
 
     def seen(self, thing: Thing) -> tuple[float, float]:
         """Return a thing's distance in metres and its bearing in radians from the camera."""
-        ahead, left = self._local(thing.x_m, thing.y_m)
-        return math.hypot(ahead, left), math.atan2(left, ahead)
+        ahead_m, left_m = self._local(thing.x_m, thing.y_m)
+        return math.hypot(ahead_m, left_m), math.atan2(left_m, ahead_m)
 
     def _local(self, x_m: float, y_m: float) -> tuple[float, float]:
         dx, dy = x_m - self.state.x_m, y_m - self.state.y_m
@@ -233,13 +234,14 @@ class World:
         first = round(-self.state.heading_rad * FOCAL_PX) % (self._wall.shape[1] - FRAME_WIDTH)
         frame[:HORIZON_ROW] = self._wall[:, first : first + FRAME_WIDTH]
         self._draw_floor(frame)
-        seen = []
+        visible = []
         for thing in (*self.distractors, self.balloon):
-            ahead, left = self._local(thing.x_m, thing.y_m)
-            if ahead > 0.12 and abs(left) < 1.2 * ahead + 0.5:
-                seen.append((ahead, left, thing))
-        for ahead, left, thing in sorted(seen, key=lambda s: -s[0]):  # far things first, so that near ones hide them
-            _draw_thing(frame, ahead, left, thing)
+            ahead_m, left_m = self._local(thing.x_m, thing.y_m)
+            if ahead_m > 0.12 and abs(left_m) < 1.2 * ahead_m + 0.5:
+                visible.append((ahead_m, left_m, thing))
+        # Far things first, so that near ones hide them.
+        for ahead_m, left_m, thing in sorted(visible, key=lambda s: -s[0]):
+            _draw_thing(frame, ahead_m, left_m, thing)
         depth, rate, phase = self._flicker
         gain = self._gain * (1 + depth * math.sin(rate * self.state.time_s + phase))
         lit: np.ndarray = cv2.multiply(frame, self._light, scale=gain / 128)
@@ -253,29 +255,31 @@ class World:
         s = self.state
         cos, sin = math.cos(s.heading_rad), math.sin(s.heading_rad)
         # Below the horizon a pixel (u, v) shows the floor at ahead = f h / (v - v0), left = (u0 - u) h / (v - v0).
-        ahead, left = [0, 0, FOCAL_PX * CAMERA_HEIGHT_M], [-CAMERA_HEIGHT_M, 0, CENTRE_COLUMN * CAMERA_HEIGHT_M]
-        to_local = np.array([ahead, left, [0, 1, -HORIZON_ROW]])
+        ahead_row = [0, 0, FOCAL_PX * CAMERA_HEIGHT_M]
+        left_row = [-CAMERA_HEIGHT_M, 0, CENTRE_COLUMN * CAMERA_HEIGHT_M]
+        to_local = np.array([ahead_row, left_row, [0, 1, -HORIZON_ROW]])
         to_floor = np.array([[cos, -sin, s.x_m], [sin, cos, s.y_m], [0, 0, 1]])
-        middle, flags = HORIZON_ROW + FAR_ROWS, cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        middle = HORIZON_ROW + FAR_ROWS
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         for texture, first, last in ((self._far_floor, HORIZON_ROW, middle), (self._floor, middle, FRAME_HEIGHT)):
             px_per_m = FLOOR_PX_PER_M * texture.shape[0] / FLOOR_TILE_PX
             from_crop = np.array([[1, 0, 0], [0, 1, first + 0.5], [0, 0, 1.0]])
             matrix = np.diag([px_per_m, px_per_m, 1]) @ to_floor @ to_local @ from_crop
-            where: dict[str, Any] = {"dst": frame[first:last], "flags": flags, "borderMode": cv2.BORDER_WRAP}
-            cv2.warpPerspective(texture, matrix, (FRAME_WIDTH, last - first), **where)
+            options: dict[str, Any] = {"dst": frame[first:last], "flags": flags, "borderMode": cv2.BORDER_WRAP}
+            cv2.warpPerspective(texture, matrix, (FRAME_WIDTH, last - first), **options)
 
 
 def expert(world: World) -> tuple[float, float]:
     """Return what a good driver does now: (steering, throttle)."""
     distance, bearing = world.balloon_seen()
     bearing = _around(world, distance, bearing)
-    most = STEERING_MOST_AROUND if world.solid else STEERING_MOST
-    steering = world.left * float(np.clip(1.1 * bearing, -most, most))
+    limit = STEERING_MOST_AROUND if world.solid else STEERING_MOST
+    steering = world.left * float(np.clip(1.1 * bearing, -limit, limit))
     in_turn = 1 - 0.55 * min(1.0, abs(bearing) / 0.5)
     near = float(np.clip(0.35 + 0.65 * (distance - 0.5) / 1.2, 0.35, 1.0))
-    wanted = THROTTLE_MOST * in_turn * near
+    target = THROTTLE_MOST * in_turn * near
     before = world.state.throttle_command
-    throttle = min(max(wanted, before - THROTTLE_FALL_PER_S / RATE_HZ), before + THROTTLE_RISE_PER_S / RATE_HZ)
+    throttle = min(max(target, before - THROTTLE_FALL_PER_S / RATE_HZ), before + THROTTLE_RISE_PER_S / RATE_HZ)
     return steering, throttle
 
 
@@ -285,9 +289,9 @@ def _around(world: World, distance: float, bearing: float) -> float:
         away, at = world.seen(thing)
         if away > distance or abs(at) > SEEN_RAD:
             continue
-        least = math.asin(min(1.0, (thing.radius_m + CLEARANCE_M) / away))
-        if abs(bearing - at) < least:
-            return at + math.copysign(least, bearing - at)
+        clearance_rad = math.asin(min(1.0, (thing.radius_m + CLEARANCE_M) / away))
+        if abs(bearing - at) < clearance_rad:
+            return at + math.copysign(clearance_rad, bearing - at)
     return bearing
 
 
@@ -318,7 +322,8 @@ def _hider(rng: np.random.Generator, balloon: Thing, hidden_share: float) -> Thi
     to_balloon, bearing = math.hypot(balloon.x_m, balloon.y_m), math.atan2(balloon.y_m, balloon.x_m)
     kind = str(rng.choice(["balloon", "box", "cone"]))
     colour = (*_DISTRACTOR_BGR, *_NEARLY_RED_BGR)[int(rng.integers(len(_DISTRACTOR_BGR) + len(_NEARLY_RED_BGR)))]
-    radius, distance = rng.uniform(0.10, 0.16), to_balloon * rng.uniform(0.5, 0.65)
+    radius = rng.uniform(0.10, 0.16)
+    distance = to_balloon * rng.uniform(0.5, 0.65)
     widths = balloon.radius_m / to_balloon, radius / distance
     aside = rng.choice([-1.0, 1.0]) * (sum(widths) - 2 * hidden_share * widths[0])
     x, y = distance * math.cos(bearing + aside), distance * math.sin(bearing + aside)
@@ -400,10 +405,12 @@ def _wall(rng: np.random.Generator) -> np.ndarray:
 
 def _paint_red(rng: np.random.Generator, floor: np.ndarray, far_floor: np.ndarray, wall: np.ndarray) -> None:
     """Paint round spots in a balloon's red on the floor, and on the wall above the horizon."""
-    blurred, turn = FLOOR_TILE_PX // far_floor.shape[0], wall.shape[1] - FRAME_WIDTH
+    blurred = FLOOR_TILE_PX // far_floor.shape[0]
+    turn = wall.shape[1] - FRAME_WIDTH
     for _ in range(int(rng.integers(1, 7))):
         colour = (int(rng.integers(20, 50)), int(rng.integers(15, 45)), int(rng.integers(170, 240)))
-        centre, radius = rng.integers(30, FLOOR_TILE_PX - 30, 2), int(rng.integers(12, 28))
+        centre = rng.integers(30, FLOOR_TILE_PX - 30, 2)
+        radius = int(rng.integers(12, 28))
         cv2.circle(floor, centre.tolist(), radius, colour, cv2.FILLED, cv2.LINE_AA)
         cv2.circle(far_floor, (centre // blurred).tolist(), radius // blurred, colour, cv2.FILLED)
         place = int(rng.integers(20, turn - 20)), int(rng.integers(20, HORIZON_ROW - 25))
@@ -440,11 +447,11 @@ _SHIFT = 3  # coordinates are in eighths of a pixel, so that a thing moves smoot
 _ONE = 1 << _SHIFT
 
 
-def _draw_thing(frame: np.ndarray, ahead: float, left: float, thing: Thing) -> None:
-    scale = FOCAL_PX / ahead
-    column = CENTRE_COLUMN - left * scale
+def _draw_thing(frame: np.ndarray, ahead_m: float, left_m: float, thing: Thing) -> None:
+    scale = FOCAL_PX / ahead_m
+    column = CENTRE_COLUMN - left_m * scale
     foot = HORIZON_ROW + CAMERA_HEIGHT_M * scale
-    _draw_shadow(frame, column, foot, thing.radius_m, ahead)
+    _draw_shadow(frame, column, foot, thing.radius_m, ahead_m)
     if thing.kind == "balloon":
         middle = HORIZON_ROW + (CAMERA_HEIGHT_M - thing.height_m) * scale
         string = (int(column), int(middle)), (int(column + 0.01 * scale), int(min(foot, 2 * FRAME_HEIGHT)))
@@ -480,7 +487,9 @@ def _draw_sphere(frame: np.ndarray, column: float, row: float, radius: float, co
     rings = int(np.clip(radius / 8, 3, 14))  # enough that a near balloon shows no steps
     for i in range(rings):
         share = i / (rings - 1)
-        size, shade, lift = radius * (1 - 0.85 * share), 0.62 + 0.50 * share, 70 * max(0.0, share - 0.7) / 0.3
+        size = radius * (1 - 0.85 * share)
+        shade = 0.62 + 0.50 * share
+        lift = 70 * max(0.0, share - 0.7) / 0.3
         centre = round((column - 0.28 * radius * share) * _ONE), round((row - 0.33 * radius * share) * _ONE)
         axes = max(1, round(size * _ONE)), max(1, round(1.12 * size * _ONE))
         lit = [min(255.0, c * shade + lift) for c in colour]

@@ -39,14 +39,16 @@ class Line:
         link = self._link or ServoLink(self.port)
         if self._link is None:
             link.open()
-        self._link, self._users = link, self._users + 1
+        self._link = link
+        self._users = self._users + 1
         return link
 
     def close(self) -> None:
         """Give the link back. When the last user does, neutral is sent and the port is closed. Raises nothing."""
         self._users -= 1
         if not self._users and self._link:
-            link, self._link = self._link, None
+            link = self._link
+            self._link = None
             link.close()
 
 

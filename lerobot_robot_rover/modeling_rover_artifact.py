@@ -43,10 +43,13 @@ class RoverArtifactPolicy(PreTrainedPolicy):
     def __init__(self, config: RoverArtifactConfig, dataset_meta: Any = None, **kwargs: Any):
         super().__init__(config)
         self.config: RoverArtifactConfig = config
-        self._limits, self._settings = this_car().limits, Settings.of(params()["drive"])
+        self._limits = this_car().limits
+        self._settings = Settings.of(params()["drive"])
         self._queue: deque[Tensor] = deque()
-        self._smoother, self._warned = Smoother(), False
-        self._planned_s, self._plans = 0.0, 0  # when the queue was filled
+        self._smoother = Smoother()
+        self._warned = False
+        self._planned_s = 0.0  # when the queue was filled
+        self._plans = 0
         self._process = PolicyProcess(config.file)
         weakref.finalize(self, self._process.close)  # at the program's end too, and if _check() refuses it
         self._process.__enter__()  # returns after the first inferences, which are slow
@@ -62,7 +65,8 @@ class RoverArtifactPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Prepare for an episode: wait for the human's gesture, which is not part of it, if a rover is connected."""
         self._queue.clear()
-        self._smoother, self._warned = Smoother(), False
+        self._smoother = Smoother()
+        self._warned = False
         wait_for_humans()
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -96,8 +100,9 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         """
         camera = f"{OBS_IMAGES}.{self._camera}"
         if not {camera, OBS_STATE} <= set(batch):
-            what, remedy = "the policy needs", f"--robot.camera_name={self._camera} --dataset.video=true"
-            raise PolicyError(f"{what} {camera} and {OBS_STATE}", found=sorted(map(str, batch)), remedy=remedy)
+            remedy = f"--robot.camera_name={self._camera} --dataset.video=true"
+            problem = f"the policy needs {camera} and {OBS_STATE}"
+            raise PolicyError(problem, found=sorted(map(str, batch)), remedy=remedy)
         pictures = (batch[camera].detach().cpu() * 255).round().clamp(0, 255).to(torch.uint8)
         states = batch[OBS_STATE].detach().cpu().numpy()
         chunks = []
@@ -122,26 +127,29 @@ class RoverArtifactPolicy(PreTrainedPolicy):
 
     def _save_pretrained(self, save_directory: Path, state_dict: Any = None) -> None:
         """Write the artifact and a config that names it."""
-        file, inputs = self.config.file, {OBS_STATE: PolicyFeature(FeatureType.STATE, (2,))}
+        file = self.config.file
+        inputs = {OBS_STATE: PolicyFeature(FeatureType.STATE, (2,))}
         for c in self._process.manifest["cameras"]:
             inputs[f"{OBS_IMAGES}.{c['name']}"] = PolicyFeature(FeatureType.VISUAL, (3, c["height"], c["width"]))
         outputs = {ACTION: PolicyFeature(FeatureType.ACTION, (2,))}
         shutil.copyfile(file, save_directory / file.name)
-        given: dict[str, Any] = {"artifact": file.name, "input_features": inputs, "output_features": outputs}
-        replace(self.config, **given)._save_pretrained(save_directory)
+        changes: dict[str, Any] = {"artifact": file.name, "input_features": inputs, "output_features": outputs}
+        replace(self.config, **changes)._save_pretrained(save_directory)
 
     def _check(self, manifest: dict[str, Any], dataset_meta: Any) -> None:
         """Raise PolicyError or ParamsError unless LeRobot's loop can run this artifact as `rover drive` would."""
         cameras = [camera["name"] for camera in manifest["cameras"]]
         names = manifest["state_names"], manifest["action_names"]
         if names != ([*ACTIONS], [*ACTIONS]) or len(cameras) != 1:
-            what = "the rover has one camera, and steering and throttle as state and actions"
-            raise PolicyError(what, found=f"{cameras} and {names}")
+            problem = "the rover has one camera, and steering and throttle as state and actions"
+            raise PolicyError(problem, found=f"{cameras} and {names}")
         self._camera = cameras[0]
-        rate_hz, chunk, stop_s = float(manifest["rate_hz"]), int(manifest["chunk"]), self._settings.stop_s
-        if self.config.n_action_steps > (most := min(chunk, int(stop_s * rate_hz))):
-            what = f"n_action_steps may be {most} at most: `rover drive` stops by a plan of {stop_s:g} s"
-            raise ParamsError(what, found=self.config.n_action_steps)
+        rate_hz = float(manifest["rate_hz"])
+        chunk = int(manifest["chunk"])
+        stop_s = self._settings.stop_s
+        if self.config.n_action_steps > (limit := min(chunk, int(stop_s * rate_hz))):
+            problem = f"n_action_steps may be {limit} at most: `rover drive` stops by a plan of {stop_s:g} s"
+            raise ParamsError(problem, found=self.config.n_action_steps)
         if sentence := another_car(manifest, this_car()):
             _log.warning(sentence)
         for asks, option in ((find_rollout(), "--fps"), (dataset_meta, "--dataset.fps")):

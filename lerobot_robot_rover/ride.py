@@ -29,7 +29,10 @@ class Ride:
     """One drive, from arming to neutral: begin(), then put() at least every HOLD_S, then end()."""
 
     def __init__(self, camera: Camera, link: ServoLink, settings: Settings, log: FlightLog):
-        self._camera, self._link, self._settings, self._log = camera, link, settings, log
+        self._camera = camera
+        self._link = link
+        self._settings = settings
+        self._log = log
         self._sight = Sight(camera, settings)
         self._action = (0.0, 0.0)
         self._given_s = 0.0
@@ -60,9 +63,12 @@ class Ride:
         if self.over:
             self.check()
             late_ms = (time.monotonic() - self._given_s) * 1e3
-            what = f"LeRobot's loop gave no action for {late_ms:.0f} ms, and after {HOLD_S * 1e3:g} the car was stopped"
-            raise DriveFault(what, remedy="is the policy too slow for it? `rover drive` plans while it drives")
-        self._action, self._given_s = (steering, throttle), time.monotonic()
+            problem = (
+                f"LeRobot's loop gave no action for {late_ms:.0f} ms, and after {HOLD_S * 1e3:g} the car was stopped"
+            )
+            raise DriveFault(problem, remedy="is the policy too slow for it? `rover drive` plans while it drives")
+        self._action = (steering, throttle)
+        self._given_s = time.monotonic()
 
     def check(self) -> None:
         """Raise what ended the drive, if it was a fault or the human's takeover."""
@@ -77,8 +83,6 @@ class Ride:
         if self._thread.ident is not None and self._thread is not threading.current_thread():
             self._thread.join()
 
-    # ---- in the thread: the pilot of loop.drive
-
     def ready(self, stop: threading.Event) -> None:
         """Return at once: there is an action from the start."""
 
@@ -89,7 +93,8 @@ class Ride:
             self._sight.watch(frame, now_s)
             self._sight.watch_motion(frame)
         steering, throttle = self._action
-        pulses, number = self._link.calibration.pulses(steering, throttle), frame.number if frame else 0
+        pulses = self._link.calibration.pulses(steering, throttle)
+        number = frame.number if frame else 0
         return Order(steering, throttle, pulses.steering_us, pulses.throttle_us, frame=number)
 
     def sent(self, at_s: float, order: Order) -> None:
@@ -110,7 +115,8 @@ class Ride:
         before = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
         health = HealthWatch(self.report, self._link, self._log, self._settings.undervoltage_s)
-        until, hooks = Until(stop=self._stop, over=self._late), Hooks(self._arm, health)
+        until = Until(stop=self._stop, over=self._late)
+        hooks = Hooks(self._arm, health)
         try:
             drive(self, self._link, self._log, rate_hz=RATE_HZ, until=until, hooks=hooks, report=self.report)
         except BaseException as error:  # of any kind: LeRobot's loop must learn of it

@@ -18,7 +18,8 @@ def find_rollout() -> Any:
 
 def check_rollout(config: Any) -> None:
     """Raise ParamsError for what a car cannot take, with all options that must be given. config: of find_rollout."""
-    strategy, options = config.strategy, []
+    strategy = config.strategy
+    options = []
     if type(strategy).__name__ == "DAggerStrategyConfig":  # its pause repeats an action, by which a car drives on
         raise ParamsError("DAgger's pause would drive a car on", remedy="record takeovers: rover drive --record")
     if config.interpolation_multiplier != 1:  # the robot waits for a new picture each time: a plan would last longer

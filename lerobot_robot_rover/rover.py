@@ -88,10 +88,10 @@ class Rover(CarPart, Robot):
             check_rollout(rollout)
         with ExitStack() as stack:
             self._log = stack.enter_context(self._flight_log())
-            wanted = self.config.width, self.config.height
-            self._camera = stack.enter_context(Camera(self.config.camera, size=size_like(*wanted)))
+            size = self.config.width, self.config.height
+            self._camera = stack.enter_context(Camera(self.config.camera, size=size_like(*size)))
             if frame := self._camera.latest():
-                check_shape(self.config.camera, frame.image, wanted)
+                check_shape(self.config.camera, frame.image, size)
             self._link: ServoLink = self._line.open()
             stack.callback(self._line.close)
             stack.callback(self._end_ride)
@@ -100,7 +100,8 @@ class Rover(CarPart, Robot):
             self._sight = Sight(self._camera, self.settings)
             self._seen = 0  # number of the newest frame that LeRobot was given
             self._captured_s = self._looked_s = 0.0
-            self._action, self._acted_s = NEUTRAL, 0.0
+            self._action = NEUTRAL
+            self._acted_s = 0.0
             if not self._line.transmitters:
                 self._wait_for_human()
             self._line.before_drive = self._wait_for_human
@@ -129,7 +130,9 @@ class Rover(CarPart, Robot):
             self._sight.watch(frame, now_s)
         if now_s - self._acted_s > HOLE_S:  # another episode
             self._action = NEUTRAL
-        self._seen, self._captured_s, self._looked_s = frame.number, frame.captured_s, boottime()
+        self._seen = frame.number
+        self._captured_s = frame.captured_s
+        self._looked_s = boottime()
         picture = prepare_frame(frame.image, self.config.height, self.config.width)
         return {**named(*self._action), self.config.camera_name: picture}
 
@@ -148,13 +151,15 @@ class Rover(CarPart, Robot):
         else:
             limit = self.settings.throttle_limit
             steering, throttle = self._driven(steering, max(min(throttle, limit), -limit))
-        self._action, self._acted_s = (steering, throttle), time.monotonic()
+        self._action = (steering, throttle)
+        self._acted_s = time.monotonic()
         return named(*self._action)
 
     def disconnect(self) -> None:
         """Send neutral, then close everything. Raises DeviceNotConnectedError."""
         self._check_connected()
-        opened, self._open = self._open, None
+        opened = self._open
+        self._open = None
         opened.close()  # type: ignore[union-attr]  # it is connected
 
     def _check_connected(self) -> None:
@@ -173,7 +178,8 @@ class Rover(CarPart, Robot):
         arm_when_ready(lambda: None, self._link, threading.Event(), self._log.event, [self._camera.latest])
 
     def _next_frame(self) -> Any:
-        newest, after = self._camera.latest(), self._seen
+        newest = self._camera.latest()
+        after = self._seen
         if newest and time.monotonic() - newest.captured_s > LATE_FRAME_S:  # nobody asked for a while
             after = max(after, newest.number)
         if frame := self._camera.wait(after, LATE_FRAME_S):

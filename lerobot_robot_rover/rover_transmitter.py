@@ -75,8 +75,10 @@ class RoverTransmitter(CarPart, Teleoperator):
         sticks = _sticks(telemetry)
         steering, throttle = link.calibration.actions(*sticks) if sticks else (None, None)
         if telemetry is None or steering is None or throttle is None:
-            what = f"{self.config.port}: the transmitter's signal was lost, and LeRobot cannot record that"
-            raise LinkError(what, remedy=f"{link.remedy('s')} and record this episode again; those before it are kept")
+            problem = f"{self.config.port}: the transmitter's signal was lost, and LeRobot cannot record that"
+            raise LinkError(
+                problem, remedy=f"{link.remedy('s')} and record this episode again; those before it are kept"
+            )
         self._check_passed_on(telemetry, link.calibration.throttle)
         self._line.humans_action = True
         return named(steering, throttle)
@@ -104,8 +106,8 @@ class RoverTransmitter(CarPart, Teleoperator):
             return
         self._withheld_s = telemetry.host_s if self._withheld_s is None else self._withheld_s
         if telemetry.host_s - self._withheld_s > WITHHELD_S:
-            what = f"{self.config.port}: the car does not get the stick's throttle, which was not at rest yet"
-            raise LinkError(what, remedy=f"{MISSING['t']}, then drive")
+            problem = f"{self.config.port}: the car does not get the stick's throttle, which was not at rest yet"
+            raise LinkError(problem, remedy=f"{MISSING['t']}, then drive")
 
 
 def _sticks(telemetry: Telemetry | None) -> tuple[int, int, int, int] | None:

@@ -90,7 +90,7 @@ def usual_rate_hz(recordings: Recordings) -> float:
 
 
 def _parts(
-    episode: Episode, size: tuple[int, int] | None, recorded: tuple[int, ...], left_out: Counter[str]
+    episode: Episode, size: tuple[int, int] | None, recorded_shape: tuple[int, ...], left_out: Counter[str]
 ) -> Iterator[list[tuple[Sample, np.ndarray]]]:
     """Yield the parts of an episode that have no hole, as samples with their RGB frames; a part may be empty.
 
@@ -106,10 +106,10 @@ def _parts(
             left_out["nobody_drove"] += 1
             continue
         frame = sample.frame_bgr()
-        if size is None and frame.shape != recorded:
-            sizes = f"{frame.shape[1]}x{frame.shape[0]} among those of {recorded[1]}x{recorded[0]}"
+        if size is None and frame.shape != recorded_shape:
+            sizes = f"{frame.shape[1]}x{frame.shape[0]} among those of {recorded_shape[1]}x{recorded_shape[0]}"
             raise EpisodeError(f"{sample.frame_path}: a picture of {sizes}", remedy="export all at one --size")
-        rows.append((sample, prepare_frame(frame, *(size or recorded[:2]))))
+        rows.append((sample, prepare_frame(frame, *(size or recorded_shape[:2]))))
     yield rows
 
 
@@ -122,8 +122,8 @@ def _write(
 
     disable_progress_bars()
     episodes = recordings.episodes
-    recorded = recordings.samples[0].frame_bgr().shape
-    shape = (*size, 3) if size else recorded
+    recorded_shape = recordings.samples[0].frame_bgr().shape
+    shape = (*size, 3) if size else recorded_shape
     by_policy = any(e.by_policy for e in episodes)
     dataset = LeRobotDataset.create(
         repo_id=f"local/{root.name}",
@@ -141,7 +141,7 @@ def _write(
         warnings.filterwarnings("ignore", "Converting input from bool")
         try:
             for episode in progress(episodes, desc="exporting", total=len(episodes)):
-                for rows in _parts(episode, size, recorded, left_out):
+                for rows in _parts(episode, size, recorded_shape, left_out):
                     if len(rows) < SHORTEST:
                         left_out["too_short"] += len(rows)
                         continue
@@ -159,7 +159,8 @@ def _write(
     lengths = [count for _, _, count in rows_written]
     return {
         "dataset": "LeRobotDataset v3, images",
-        "pictures": f"{shape[1]}x{shape[0]}" + ("" if shape == recorded else f", recorded {recorded[1]}x{recorded[0]}"),
+        "pictures": f"{shape[1]}x{shape[0]}"
+        + ("" if shape == recorded_shape else f", recorded {recorded_shape[1]}x{recorded_shape[0]}"),
         "episodes": len(rows_written),
         "frames": sum(lengths),
         "frames_in_a_usual_episode": int(np.median(lengths)),

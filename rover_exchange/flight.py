@@ -80,7 +80,8 @@ def _draw_pulses(ax: Axes, channel: Channel, ticks: Mapping[str, np.ndarray], co
 
 
 def _draw_plan(ax: Axes, ticks: Mapping[str, np.ndarray], drive: Mapping[str, Any]) -> None:
-    t_s, plans = ticks["t_s"], ticks["plan"]
+    t_s = ticks["t_s"]
+    plans = ticks["plan"]
     ax.plot(t_s, ticks["plan_age_ms"], color=SLATE, lw=1.1, label="age of the plan")
     _, first = np.unique(plans, return_index=True)
     first = first[plans[first] > 0]

@@ -44,7 +44,8 @@ class Front(nn.Module):
 
     def __init__(self, policy: ACT):
         super().__init__()
-        self.backbone, self.image_project = policy.backbone, policy.image_project
+        self.backbone = policy.backbone
+        self.image_project = policy.image_project
 
     def forward(self, picture: Tensor) -> Tensor:
         return self.image_project(self.backbone(picture))
@@ -55,9 +56,14 @@ class Rest(nn.Module):
 
     def __init__(self, policy: ACT):
         super().__init__()
-        self.encoder, self.decoder, self.memory = policy.encoder, policy.decoder, policy.memory
-        self.encoder_norm, self.norm, self.head = policy.encoder_norm, policy.norm, policy.head
-        self.state_norm, self.state_project = policy.state_norm, policy.state_project
+        self.encoder = policy.encoder
+        self.decoder = policy.decoder
+        self.memory = policy.memory
+        self.encoder_norm = policy.encoder_norm
+        self.norm = policy.norm
+        self.head = policy.head
+        self.state_norm = policy.state_norm
+        self.state_project = policy.state_project
         self.action_unnorm = policy.action_unnorm
         self.latent, self.pos, self.q_pos = (nn.Buffer(x) for x in (policy.latent, policy.pos, policy.q_pos))
 
@@ -95,9 +101,14 @@ def write_kit(run_dir: Path | str, progress: Progress = silent) -> dict[str, Any
     loaded = open_run(run_dir, progress)
     policy = ACT(loaded.checkpoint.config, loaded.checkpoint.weights)
     config, (front, rest) = policy.config, halves(policy)
-    chosen, _ = choose_calibration(loaded.parts.calibration, SAMPLES, params()["calibration"]["seed"])
-    judged = pick_evenly(loaded.parts.held_out, JUDGED)
-    gap = _gap(policy, front, rest, [inputs_of(sample, config) for sample in judged[:: max(len(judged) // 4, 1)]])
+    calibration_frames, _ = choose_calibration(loaded.parts.calibration, SAMPLES, params()["calibration"]["seed"])
+    held_out_frames = pick_evenly(loaded.parts.held_out, JUDGED)
+    gap = _gap(
+        policy,
+        front,
+        rest,
+        [inputs_of(sample, config) for sample in held_out_frames[:: max(len(held_out_frames) // 4, 1)]],
+    )
     if not gap <= 1e-4:  # written so that NaN fails
         raise ArtifactError(f"backbone and rest together differ from the policy by {gap:.3g}; nothing was written")
     blocks = multiply_accumulates(policy)
@@ -105,13 +116,18 @@ def write_kit(run_dir: Path | str, progress: Progress = silent) -> dict[str, Any
     on_cpu = sum(blocks.values()) / 1e9 - on_chip
     computed_ms: dict[str, float | None] = {chip: on_chip / rate * 1000 for chip, rate in CHIP_GMAC_PER_S.items()}
     computed_ms["cpu, FP32, at least"] = floor_ms(on_cpu, "fp32")
-    facts = {"gmac": {"chip": on_chip, "cpu": on_cpu}, "computed_ms": computed_ms, "gap": gap, "frames": len(chosen)}
+    facts = {
+        "gmac": {"chip": on_chip, "cpu": on_cpu},
+        "computed_ms": computed_ms,
+        "gap": gap,
+        "frames": len(calibration_frames),
+    }
     with build_folder(Path(run_dir) / "hailo", lambda old: old.glob("features.npy")) as folder:
         (folder / "backbone.onnx").write_bytes(front)
         (folder / "rest.onnx").write_bytes(rest)
-        (folder / "backbone.alls").write_text(model_script(config, len(chosen)))
+        (folder / "backbone.alls").write_text(model_script(config, len(calibration_frames)))
         (folder / "kit.json").write_text(json.dumps(facts, indent=1))
-        for name, frames in (("calibration", chosen), ("judged", judged)):
+        for name, frames in (("calibration", calibration_frames), ("judged", held_out_frames)):
             array = open_memmap(folder / f"{name}.npy", "w+", np.uint8, (len(frames), *config.image_sizes[0], 3))
             for i, sample in enumerate(progress(frames, desc=f"{name} frames", total=len(frames))):
                 array[i] = inputs_of(sample, config)[1].numpy()
@@ -121,12 +137,14 @@ def write_kit(run_dir: Path | str, progress: Progress = silent) -> dict[str, Any
 
 @torch.inference_mode()
 def _gap(policy: ACT, front: bytes, rest: bytes, inputs: list[tuple[Tensor, ...]]) -> float:
-    first, second, gaps = session_of(front, 1), session_of(rest, 1), []
+    first = session_of(front, 1)
+    second = session_of(rest, 1)
+    gaps = []
     for state, frame in inputs:
         (features,) = first.run(None, {"picture": policy.image_input[0](frame).contiguous().numpy()})
-        (found,) = second.run(None, {"state": state.numpy(), "features": features[0].transpose(1, 2, 0)})
-        wanted = policy(state, frame).numpy()
-        gaps.append(np.abs(found - wanted).max() / max(np.abs(wanted).max(), 1))
+        (chunk,) = second.run(None, {"state": state.numpy(), "features": features[0].transpose(1, 2, 0)})
+        expected = policy(state, frame).numpy()
+        gaps.append(np.abs(chunk - expected).max() / max(np.abs(expected).max(), 1))
     return float(np.max(gaps))
 
 
@@ -149,16 +167,18 @@ class Returned:
     """
 
     def __init__(self, folder: Path, like: Any):
-        self.action_names, self.chunk = like.action_names, like.chunk
+        self.action_names = like.action_names
+        self.chunk = like.chunk
         self._low, self._high = action_limits(like.action_names, like.car)
         frames = np.load(folder / "judged.npy", mmap_mode="r")
         self._features = np.load(folder / "features.npy", allow_pickle=False)
         self._rest = session_of((folder / "rest.onnx").read_bytes(), 1)
         shape = (len(frames), *self._rest.get_inputs()[1].shape)
         if self._features.shape != shape or not np.isfinite(self._features).all():
-            what = f"{folder / 'features.npy'}: not the features of judged.npy, {shape} and finite"
-            raise PolicyError(what, found=self._features.shape, remedy="one for each frame, channels last")
-        self._size, self._places = frames.shape[1:3], {frame.tobytes(): i for i, frame in enumerate(frames)}
+            problem = f"{folder / 'features.npy'}: not the features of judged.npy, {shape} and finite"
+            raise PolicyError(problem, found=self._features.shape, remedy="one for each frame, channels last")
+        self._size = frames.shape[1:3]
+        self._places = {frame.tobytes(): i for i, frame in enumerate(frames)}
 
     def predict_chunk(self, frame_bgr: Any, state: np.ndarray) -> np.ndarray:
         """As an artifact does, (C, A) float32. Raises PolicyError for a frame that is not in judged.npy."""
@@ -166,8 +186,8 @@ class Returned:
         place = self._places.get(prepare_frame(frame, *self._size).tobytes())
         if place is None:
             raise PolicyError("a held-out frame is not in judged.npy", remedy="make the kit of this run again")
-        named = {"state": np.asarray(state, np.float32)[None], "features": self._features[place].astype(np.float32)}
-        return np.clip(self._rest.run(None, named)[0][0], self._low, self._high)
+        inputs = {"state": np.asarray(state, np.float32)[None], "features": self._features[place].astype(np.float32)}
+        return np.clip(self._rest.run(None, inputs)[0][0], self._low, self._high)
 
 
 def judge(run_dir: Path | str, fp32: Any, loaded: Opened) -> Fidelity | None:

@@ -50,7 +50,7 @@ def moments_of(flight: Flight) -> list[Moment]:
     if not len(t_s):
         raise RoverError(f"{flight.path}: nothing was driven in this drive", remedy="choose another by --drive")
     begin_s = began_s(flight)
-    commanded = np.stack([ticks["steering"], ticks["throttle"]], axis=1)
+    commands = np.stack([ticks["steering"], ticks["throttle"]], axis=1)
     episode = find_recording(flight)
     moments = []
     for at_s, frame in pictures_of(episode):
@@ -59,7 +59,7 @@ def moments_of(flight: Flight) -> list[Moment]:
         if i < 0 or now_s > t_s[-1] + LATE_S:
             continue
         tick = plain({name: ticks[name][i] for name in Tick._fields})
-        ahead = commanded[i : i + round(1000 / period_ms)]
+        ahead = commands[i : i + round(1000 / period_ms)]
         events = [f"{e.t_s:.1f} s  {e.text}" for e in flight.events if e.t_s <= now_s]
         moments.append(Moment(now_s, frame, tick, ahead, events[-1] if events else ""))
     if not moments:
@@ -71,12 +71,12 @@ def find_recording(flight: Flight) -> Path:
     """Return the folder of the episode recorded with a drive. Raises EpisodeError if there is none, or it is gone."""
     for event in reversed(flight.events):
         if event.text.startswith(RECORDED):
-            named = Path(event.text.removeprefix(RECORDED))
-            for path in (named, flight.path.parent / named, flight.path.parent / "episodes" / named.name):
+            folder = Path(event.text.removeprefix(RECORDED))
+            for path in (folder, flight.path.parent / folder, flight.path.parent / "episodes" / folder.name):
                 if path.is_dir():
                     return path
             remedy = f"copy that folder to {flight.path.parent / 'episodes'}"
-            raise EpisodeError(f"{named}: the drive's pictures are not there", remedy=remedy)
+            raise EpisodeError(f"{folder}: the drive's pictures are not there", remedy=remedy)
     remedy = "`rover drive --record FOLDER` records them"
     raise EpisodeError(f"{flight.path}: no pictures were recorded with this drive", remedy=remedy)
 

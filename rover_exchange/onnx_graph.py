@@ -57,21 +57,22 @@ class _Writer(Interpreter):
 
     def __init__(self, graph: GraphModule, inputs: Mapping[str, Tensor], outputs: Sequence[str]):
         super().__init__(graph)
-        self._inputs, self._outputs = dict(inputs), list(outputs)
+        self._inputs = dict(inputs)
+        self._outputs = list(outputs)
         self._free = iter(self._inputs)  # names that no placeholder has taken yet
         self._nodes: list[onnx.NodeProto] = []
         self._constants: dict[str, onnx.TensorProto] = {}
         self.names: dict[Any, Any] = {}
         self.calls: Counter[Any] = Counter()
 
-    def model(self, made: Sequence[Tensor]) -> onnx.ModelProto:
-        """Return the ONNX model of the graph that has run. made: what it returned."""
+    def model(self, outputs: Sequence[Tensor]) -> onnx.ModelProto:
+        """Return the ONNX model of the graph that has run. outputs: what it returned."""
         used = {name for node in self._nodes for name in node.input}
         graph = helper.make_graph(
             self._nodes,
             "policy",
             [_info(name, tensor) for name, tensor in self._inputs.items()],
-            [_info(name, tensor) for name, tensor in zip(self._outputs, made, strict=True)],
+            [_info(name, tensor) for name, tensor in zip(self._outputs, outputs, strict=True)],
             # A scale that torch reads from a constant is not used.
             [c for name, c in self._constants.items() if name in used],
         )
@@ -122,7 +123,8 @@ class _Writer(Interpreter):
 
     def as_float(self, n: Any, user: str = "output") -> str:
         """Return the name of a value in floats. Each user of an INT8 value gets its own DequantizeLinear, as in QDQ."""
-        value, name = self.env[n], self.names[n]
+        value = self.env[n]
+        name = self.names[n]
         if not value.is_quantized:
             return name
         return self.add("DequantizeLinear", [name, *self._steps(name, value)], f"{name}_for_{user}")

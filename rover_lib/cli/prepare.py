@@ -35,7 +35,6 @@ class Resumable(click.Command):
     """A long command that, run again after Ctrl-C, resumes."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run it."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
@@ -163,11 +162,8 @@ def export(
     """
     if not (onnx or card or hailo):
         raise click.UsageError("for what? --onnx, --hailo or --card")
-    if (
-        not (card or hailo)
-        and not (source / "quantize.json").is_file()
-        and {"checkpoint", "pretrained"} & {*kinds_of(source)}
-    ):
+    is_run = card or hailo or (source / "quantize.json").is_file()
+    if not is_run and {"checkpoint", "pretrained"} & {*kinds_of(source)}:
         from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
         from rover_lib.workshop.run.pipeline import export_graph
 

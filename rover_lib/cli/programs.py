@@ -66,19 +66,14 @@ def notebooks(run_dir: Path, name: str | None) -> None:
     if copy == run_dir.resolve() or (copy.exists() and not (copy / first).is_file()):
         raise RoverError(f"{copy}: is the run itself, or no copy of one", remedy="name the copy otherwise: --as try1")
     if not copy.exists():
-        copy_run(run_dir, copy)
+        with build_folder(copy) as new:
+            for path in (path for pattern in COPIED for path in run_dir.glob(pattern)):
+                if path.is_dir():
+                    shutil.copytree(path, new / path.name)
+                else:
+                    shutil.copy2(path, new)
     own = ["--allow-root"] if os.geteuid() == 0 else []  # a container may have no user but root
     words = [sys.executable, "-m", "jupyterlab", *own, f"--LabApp.default_url=/lab/tree/{first}", str(copy)]
     # JupyterLab then saves widgets' state, without which a notebook that is opened again shows errors in their place.
     settings = os.pathsep.join(filter(None, (str(JUPYTER), os.environ.get("JUPYTER_CONFIG_PATH"))))
     os.execve(sys.executable, words, {**os.environ, **KERNEL_ENVIRONMENT, "JUPYTER_CONFIG_PATH": settings})
-
-
-def copy_run(run_dir: Path, copy: Path) -> None:
-    """Copy what a run's notebooks made; `copy` appears only once it is complete."""
-    with build_folder(copy) as new:
-        for path in (path for pattern in COPIED for path in run_dir.glob(pattern)):
-            if path.is_dir():
-                shutil.copytree(path, new / path.name)
-            else:
-                shutil.copy2(path, new)

@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from numbers import Real
 from typing import Any, NamedTuple, TypeGuard
 
 
 def is_number(value: object, least: float = -math.inf, most: float = math.inf) -> TypeGuard[float]:
-    """Whether it is a finite int or float from `least` to `most`. Rejects bools and overflow."""
+    """Whether it is a finite number, also numpy's, from `least` to `most`. Rejects bools and overflow."""
     try:
-        number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
         return number and least <= value <= most  # type: ignore[operator]
     except OverflowError:
         return False

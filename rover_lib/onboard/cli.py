@@ -188,8 +188,10 @@ def run_drive(json_file: Path | None, car: Any = None, **options: Any) -> int:
         code = 3
     if json_file and json_file != Path("-"):
         json_file.write_text(json.dumps(report.summary(), indent=2) + "\n")
+    elif json_file:
+        show(report.summary(), True)
     else:
-        show(report.summary() if json_file else in_words(report.summary()), bool(json_file))
+        show(in_words(report.summary()), False)
     return code
 
 
@@ -224,11 +226,12 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, finish: bool, **o
                 notify(f"rover: {error}")
         if not parts:
             click.echo(f"{out_dir}: nothing to finish")
-        ctx.exit(1 if failed else 0)
+        ctx.exit(int(failed))
     options |= {"rate_hz": hz, "notify": notify}
     for report in record_episodes(folder=out_dir, **options):
         click.echo(str(report))
-    ctx.exit(1 if report.fault else 0)
+    if report.fault:
+        ctx.exit(1)
 
 
 @main.command(short_help="Check all that driving needs; say what to do.")
@@ -254,10 +257,11 @@ def doctor(ctx: click.Context, port: str, hz: float, receiver: bool, **asked: An
     failed = []
     for check in found:
         click.echo(str(check))
-        failed += [check.name] if check.verdict == "fail" else []
+        if check.verdict == "fail":
+            failed.append(check.name)
     if failed:
         notify(f"rover: this car would not drive: {', '.join(failed)}")
-    ctx.exit(1 if failed else 0)
+        ctx.exit(1)
 
 
 @main.command(short_help="Measure another car's transmitter; write its car.yml.")
@@ -399,14 +403,10 @@ def stage(releases: Any, source: Path, **options: Any) -> None:
 
 @release.command(short_help="Verify that a release computes what it should.")
 @click.argument("name", default="current")
-@click.option("--confined", is_flag=True, help="First drop all rights that an inference does not need.")
 @click.pass_obj
-def verify(releases: Any, name: str, confined: bool) -> None:
+def verify(releases: Any, name: str) -> None:
     """Verify that a release is complete and computes here what it should, by checksums and parity vectors."""
-    if confined:
-        releases.verify(name, confined=True)
-    else:
-        releases.check(name)
+    releases.check(name)
     click.echo(f"{name}: verified")
 
 
@@ -496,8 +496,11 @@ def open_view(
     from rover_lib.onboard.view.server import Address, View, read_token
 
     token = read_token(token_file) if token_file else secrets.token_urlsafe(16)
-    place = None if shown else feed or default_view()
-    of_simulation = {"car": shown.car, "ask": shown.ask, "script": shown.script} if shown else {}
+    place: Path | None = feed or default_view()
+    of_simulation = {}
+    if shown:
+        place = None
+        of_simulation = {"car": shown.car, "ask": shown.ask, "script": shown.script}
     view = View(Address(web_port, interface), token, place, drive_user=drive_user, **of_simulation)
 
     def tell(url: str) -> None:
@@ -526,8 +529,11 @@ def sum_up(file: Path, drive: int, as_json: bool) -> Any:
 
     flight = read_log(file, drive)
     summary = flight.summary()
-    show(summary if as_json else in_words({k: v for k, v in summary.items() if k != "events"}), as_json)
-    for event in () if as_json else flight.events:
+    if as_json:
+        show(summary, as_json)
+        return flight
+    show(in_words({k: v for k, v in summary.items() if k != "events"}), as_json)
+    for event in flight.events:
         click.echo(f"{event.t_s:9.2f} s  {event.text}")
     return flight
 

@@ -30,8 +30,12 @@ class RoverError(Exception):
         self.what, self.found, self.remedy, self.kind = what, found, remedy, kind
 
     def __str__(self) -> str:
-        text = self.what if self.found is None else f"{self.what}, found {self.found}"
-        return f"{text}; {self.remedy}" if self.remedy else text
+        text = self.what
+        if self.found is not None:
+            text += f", found {self.found}"
+        if self.remedy:
+            text += f"; {self.remedy}"
+        return text
 
 
 def of_system(error: OSError) -> RoverError:

@@ -142,7 +142,6 @@ class Preset(click.Option):
         self._preset = preset
 
     def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
-        """Return the option's names and its help."""
         record = super().get_help_record(ctx)
         with suppress(RoverError, KeyError):  # of a bad params.yml; the command itself says that
             value = self._preset(params(), ctx.command.name or "")

@@ -133,12 +133,11 @@ def environment() -> dict[str, Any]:
 
     A value is None if it is unknown or not installed. `engine` is also None if this process has not loaded torch.
     """
-    try:
+    commit = None
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
         command = ["git", "rev-parse", "--short", "HEAD"]
         git = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, timeout=5)
         commit = git.stdout.strip() or None
-    except (OSError, subprocess.SubprocessError):
-        commit = None
     torch = sys.modules.get("torch")  # not imported for this
     return {
         "host": socket.gethostname(),

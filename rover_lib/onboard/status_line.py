@@ -47,7 +47,8 @@ class StatusLine(logging.Handler):
                 text = f"{self._status() if line is None else line}\n"
             except queue.Empty:
                 text = self._status() + ("" if self._terminal else "\n")
-            text = f"\r\x1b[K{text}" if self._terminal else text
+            if self._terminal:
+                text = f"\r\x1b[K{text}"
             with contextlib.suppress(OSError, ValueError):  # nobody reads standard error any more
                 # Not through its buffer: if this thread got stuck with its lock, the program could not end.
                 os.write(sys.stderr.fileno(), text.encode(errors="replace"))

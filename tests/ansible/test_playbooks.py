@@ -231,7 +231,7 @@ def test_the_units_say_what_the_command_line_takes(units):
         known = {o for p in main.commands[words[0]].params for o in p.opts}
         assert {word for word in words if word.startswith("--")} <= known
     assert drive[:2] == ["drive", "--service"] and f"LimitRTPRIO={PRIORITY}\n" in (units / DRIVE).read_text()
-    assert check[:-1] == ["release", "--models", "/var/lib/rover/models", "verify", "--confined"]
+    assert check[:-1] == ["release", "--models", "/var/lib/rover/models", "verify"]
     assert drive[drive.index("--view") + 1] == view[view.index("--feed") + 1]
 
 

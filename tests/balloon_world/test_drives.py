@@ -120,9 +120,6 @@ def test_a_kill_costs_the_drives_that_had_not_ended(tmp_path, monkeypatch):
     assert drive_missing(None, asked, one, path) == found and not driven
 
 
-# --- trials ---
-
-
 AHEAD = 21783  # in this world and the next two the balloon is straight ahead
 
 

@@ -48,7 +48,7 @@ def test_the_map_is_of_the_level_that_was_driven(run_dir, monkeypatch):
 
     def drive(policy, world, latency_s, settings):
         levels.append(world.level.name)
-        return drives.Driven("hit", [])
+        return drives.WorldDrive("hit", [])
 
     monkeypatch.setattr(latency, "drive_in", drive)
     monkeypatch.setattr(latency, "path_of", lambda world: world.seed)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from balloon_world import drives, learn
-from balloon_world.learn import Experiment, demonstrate, drive_corrected, gates, human_beside, run_experiment
+from balloon_world.learn import Experiment, drive_corrected, gates, human_beside, run_experiment
 from balloon_world.world import World, expert
 from rover_learn.finetune import human_samples
 from rover_lib.onboard.drive.pilot import Order
@@ -72,16 +72,6 @@ def test_who_drove_is_in_the_recording_and_what_they_did_in_the_world(tmp_path):
     assert world.hit
 
 
-def test_a_demonstration_is_a_whole_drive_or_cut(tmp_path):
-    assert demonstrate(tmp_path / "cut", 0, NotDrawn(CURVE), 1.0) == pytest.approx(1.0, abs=1 / 30)
-    whole_s = demonstrate(tmp_path / "whole", 1, NotDrawn(CURVE), 60.0)
-    (cut,), (whole,) = (load_recordings(tmp_path / name, 32).episodes for name in ("cut", "whole"))
-    assert len(cut.samples) == 30 and len(whole.samples) == pytest.approx(30 * whole_s, abs=1)
-
-
-# --- what is said ---
-
-
 def test_gates_are_of_the_last_round():
     """Of the stored results, and of the same with the arms exchanged: one of the two is sure to be no better."""
     metrics = read_stage(Path(__file__).parents[2] / "results" / "demo" / "learn.json", "learn")["metrics"]
@@ -90,9 +80,6 @@ def test_gates_are_of_the_last_round():
     assert found == pytest.approx([row["found"] for row in metrics["gates"]], rel=1e-5)
     exchanged = gates([row | {"arm": arms.get(row["arm"], row["arm"])} for row in rows])
     assert max(found[2], exchanged[2]["found"]) == 1.0
-
-
-# --- the whole ---
 
 
 @pytest.fixture(scope="module")

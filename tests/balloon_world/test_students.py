@@ -128,8 +128,6 @@ def test_what_does_not_belong_together_is_refused(made, wrong):
     assert not (made.teacher / "students.json").exists()
 
 
-# --- the rule ---
-
 LIMITS = params()["students"]
 FULL = Path(__file__).parents[2] / "results" / "full" / "students.json"
 TEACHER = read_stage(FULL, "students")["metrics"]["students"][0]  # hits 200 of 200, and 181 pushed

@@ -80,9 +80,6 @@ def test_it_ends_with_its_parent():
         parent.stdout.close()
 
 
-# ---- the worlds, without a process: what the pins ask for, and what is kept
-
-
 def pulses(steering_us, throttle_us):
     return [PinEvent(0, "pulse", "steering", steering_us, 0.0), PinEvent(0, "pulse", "throttle", throttle_us, 0.0)]
 

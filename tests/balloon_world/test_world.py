@@ -44,9 +44,6 @@ def test_the_expert_hits_almost_always(level, shoves, least):
     assert all(1 < w.state.time_s <= level.timeout_s for w in worlds)
 
 
-# --- hard ---
-
-
 def test_hard_hides_balloons_at_the_edge_and_pushes_a_slow_car_that_slips():
     """What hard has, some of its worlds have; what easy lacks, no world of it has."""
     hard = [World(seed, level=HARD) for seed in range(40)]

@@ -2,7 +2,10 @@
 
 import errno
 import json
+import shlex
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -15,11 +18,13 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import atomic_path, read_stage
 from tests.helpers.command import rover
 
+ROOT = Path(__file__).parents[2]
+
 
 def test_a_run_ends_with_its_verdict(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "runs" / "mine"
-    shutil.copytree(Path(__file__).parents[2] / "results" / "demo", folder)
+    shutil.copytree(ROOT / "results" / "demo", folder)
     monkeypatch.setattr("rover_lib.workshop.run.run.run", lambda *args, **options: folder)
     result = rover("run", __file__, tmp_path)
     assert result.exit_code == 0 and "Verdict: deploy policy_static.pt" in result.output
@@ -36,6 +41,22 @@ def test_one_notebook_is_executed_again_with_what_is_turned(tmp_path, monkeypatc
     result = rover("run", "--only", "03", "--name", "try1", "--runs-dir", tmp_path, "-p", "modes", "[static]")
     assert result.exit_code == 0, result.output
     assert asked == [(("03", tmp_path / "try1"), {"modes": ["static"]})]
+
+
+def test_make_hands_a_name_on_as_it_is():
+    dry = ["make", "-n", "--no-print-directory", f"VENV={sys.prefix}", f"--old-file={sys.prefix}/.ready"]
+    names = {
+        "run": ["CHECKPOINT=my policy.pth", "EPISODES=my drives", "NAME=mine"],
+        "notebooks-open": ["NAME=mine", "AS=try 1"],
+    }
+    lines = []
+    for target, variables in names.items():
+        done = subprocess.run([*dry, target, *variables], cwd=ROOT, capture_output=True, text=True, check=True)
+        lines.append(shlex.split(done.stdout.splitlines()[-1])[1:])
+    assert lines == [
+        ["run", "my policy.pth", "my drives", "--name", "mine"],
+        ["notebooks", "runs/mine", "--as", "try 1"],
+    ]
 
 
 def test_help_shows_what_params_yml_presets(set_params):

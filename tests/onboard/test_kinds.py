@@ -6,8 +6,8 @@ import zipfile
 import pytest
 
 from rover_lib.onboard.drive.flight_log import FlightLog
-from rover_lib.onboard.errors import CheckpointError, RoverError
-from rover_lib.onboard.kinds import WANTED, check_kind, check_output, kinds_of, refuse_pointer
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.kinds import check_kind, check_output, kinds_of
 from rover_lib.onboard.stage import write_stage
 
 
@@ -56,14 +56,3 @@ def test_an_output_takes_the_place_of_its_own_kind_only(tmp_path):
     for path in (artifact, tmp_path / "link.pt", tmp_path, tmp_path / "notes" / "new.pt", tmp_path / "load"):
         with pytest.raises(RoverError):
             check_output(path, "benchmark")
-
-
-def test_another_kind_is_refused_with_how_to_get_the_wanted_one(tmp_path):
-    with pytest.raises(RoverError, match="this is an artifact") as refused:
-        check_kind(archive(tmp_path / "policy_static.pt", "code/net.py"), "checkpoint")
-    assert refused.value.remedy == WANTED["checkpoint"][1]
-    (tmp_path / "model.safetensors").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:00\n")
-    with pytest.raises(RoverError, match="nothing: not found; rover run"):
-        check_kind(tmp_path / "nothing", "artifact")
-    with pytest.raises(CheckpointError, match="git lfs pull"):
-        refuse_pointer(tmp_path / "model.safetensors", CheckpointError)

@@ -189,9 +189,6 @@ def test_a_humans_episodes_are_recorded_read_and_replayed(eyes, plugin, tmp_path
     np.testing.assert_array_equal(*changes)
 
 
-# ---- a policy drives, and somebody ends it
-
-
 @pytest.mark.emulated
 @pytest.mark.slow
 @needs.simavr

@@ -49,7 +49,7 @@ def test_it_gives_what_our_own_loader_gives(artifacts, monkeypatch, caplog):
     now = [1000.0]
     monkeypatch.setattr(modeling_rover_artifact, "boottime", lambda: now[0])
     ours = load_policy(artifacts["static"])
-    height, width = ours.image_size
+    height, width = (ours.manifest["cameras"][0][side] for side in ("height", "width"))
     config = RoverArtifactConfig(artifact=str(artifacts["static"]), n_action_steps=3)
     policy = make_policy(config, ds_meta=dataset(camera=ours.cameras[0], size=(height, width)))
     before, after = make_pre_post_processors(config)

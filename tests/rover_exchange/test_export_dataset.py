@@ -131,9 +131,6 @@ def test_what_cannot_be_one_dataset_is_refused(recorded, tmp_path):
     assert np.array_equal([s.frame_bgr() for s in load(tmp_path / "out").samples], expected)
 
 
-# ---- who drove
-
-
 def driven(folder, *spans):
     """Write into a recording who drove. spans: (driver, its first frame), in order."""
 
@@ -185,9 +182,6 @@ def test_interventions_are_lerobots(mixed, tmp_path):
     again = load(tmp_path / "out")
     assert [s.driver for s in again.episodes[0].samples] == ["policy"] * 40
     assert [s.driver for s in again.episodes[2].samples] == ["policy"] * 15 + ["human"] * 10
-
-
-# ---- whose car
 
 
 def test_a_dataset_of_another_car_is_read_as_its_own(tmp_path, monkeypatch):

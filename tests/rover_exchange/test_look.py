@@ -117,9 +117,6 @@ def test_what_makes_no_film_leaves_nothing(tmp_path, made, output, word):
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(("out", ".out"))]
 
 
-# ---- the figure
-
-
 def lines_of(ax):
     return {line.get_label(): line for line in ax.get_lines() if not line.get_label().startswith("_")}
 

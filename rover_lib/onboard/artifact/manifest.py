@@ -13,6 +13,7 @@ import re
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -131,7 +132,7 @@ def car_of(manifest: dict[str, Any]) -> Car:
         raise ArtifactError(str(error), remedy="export it again") from None
 
 
-class Artifact:
+class Artifact(AbstractContextManager["Artifact"]):
     """An artifact that is opened once, and carries on what was read of it and checked. All raise ArtifactError.
 
     with Artifact("policy_static.pt") as artifact:
@@ -141,9 +142,6 @@ class Artifact:
     def __init__(self, path: Path | str):
         self.path = Path(path)
         self._z = open_archive(path)
-
-    def __enter__(self) -> "Artifact":
-        return self
 
     def __exit__(self, *exc: object) -> None:
         self._z.close()
@@ -177,7 +175,10 @@ class Artifact:
                 continue
             if name in ("archive/data.pkl", *programs):  # each names the class once; all other names there are kept
                 record = record.replace(module, MANGLED.sub(b"", module), 1)
-            digest.update((MANGLED.sub(b"", name.encode()) if name in programs else name.encode()) + b"\0")
+            encoded = name.encode()
+            if name in programs:
+                encoded = MANGLED.sub(b"", encoded)
+            digest.update(encoded + b"\0")
             digest.update(hashlib.sha256(record).digest())
         return digest.hexdigest()
 
@@ -202,7 +203,8 @@ class Artifact:
             raise refused(self.path, f"its parity vectors are not readable ({e})") from None
         for name, (dtype, shape) in expected.items():
             vector = vectors[name]
-            shape = shape if name in fixed else (len(vectors["state"]), *shape)
+            if name not in fixed:
+                shape = (len(vectors["state"]), *shape)
             if vector.dtype != dtype or vector.shape != shape or not len(vector):
                 raise refused(self.path, f"its parity vector {name} has another shape than its manifest says")
             if not np.isfinite(vector).all():
@@ -213,7 +215,6 @@ class Artifact:
 
     @property
     def names(self) -> list[str]:
-        """The names of its records."""
         return self._z.namelist()
 
     @property

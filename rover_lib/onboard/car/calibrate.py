@@ -1,8 +1,5 @@
 """Measure another car's transmitter through the Arduino's receiver pins, for `rover calibrate`, which writes car.yml.
 
-    with ServoLink(port) as link:
-        car = measure(link, ask=input)
-
 The human's pulses go through to the servo and the speed controller, and while several kinds of car are tried, these get
 the neutral of each. So the wheels must be off the ground and the motor unplugged.
 """

@@ -174,7 +174,6 @@ class Camera:
 
     @property
     def frames(self) -> int:
-        """How many frames have come so far."""
         return self._frame.number if self._frame else 0
 
     def _read(self, reader: Reader) -> None:
@@ -188,7 +187,8 @@ class Camera:
                         captured_s = self._captured_s(stamp_s)
                         image = decode_jpeg(picture) if isinstance(picture, bytes) else picture
                     except CameraError as error:
-                        self._refusal, refused = error, refused + 1
+                        self._refusal = error
+                        refused += 1
                         if self._frame and refused >= REFUSED_MOST:
                             raise self._failed(f"{refused} pictures in a row were no frames", error) from None
                         continue
@@ -214,7 +214,9 @@ class Camera:
             self.time_stamps = MONOTONIC
         if stamp_s is None or self.time_stamps == NO_CLOCK:
             return now_s
-        age_s, stands, self._stamp_s = now_s - stamp_s, stamp_s <= self._stamp_s, stamp_s
+        age_s = now_s - stamp_s
+        stands = stamp_s <= self._stamp_s
+        self._stamp_s = stamp_s
         if stands or not -AHEAD_S <= age_s <= OLD_S:
             actual = "the same again" if stands else f"one of {age_s:.2f} s ago"
             raise CameraError("a frame's time stamp is not of now", found=actual, remedy="plug the camera in again")
@@ -231,7 +233,8 @@ class Camera:
             raise CameraError(problem, remedy="is another program using the camera?")
         if w < LEAST[0] or h < LEAST[1]:
             raise CameraError(f"{self.source}: too small a picture to drive by", found=f"{w}x{h}")
-        sums, number = block_sums(image), self.frames + 1
+        sums = block_sums(image)
+        number = self.frames + 1
         same = (self._shown[: self._remembered] == sums).mean(axis=1).max(initial=0.0)
         self._shown[self._remembered % REMEMBERED] = sums
         self._remembered += 1

@@ -88,7 +88,6 @@ class Car:
 
     @property
     def reverses(self) -> bool:
-        """Whether it can drive backwards."""
         return self.pwm.throttle.low < 0
 
     @property
@@ -148,14 +147,16 @@ class Car:
         steering = {"period_us": period_us, "left_us": left_us, "neutral_us": neutral_us, "right_us": right_us}
         throttle = {"period_us": throttle_us, "neutral_us": rest_us, "forward_us": forward_us}
         reverse = {"reverse_us": back_us} if self.reverses else {}
-        return {
+        content = {
             "name": self.name,
             "steering": {**steering, "positive": self.positive},
             "throttle": {**throttle, **reverse, "cap_us": self.cap_us},
             "camera": {"field_of_view_deg": self.field_of_view_deg},
             "wheelbase_m": self.wheelbase_m,
-            **({"human": self.human} if self.human != HUMANS[0] else {}),
         }
+        if self.human != HUMANS[0]:
+            content["human"] = self.human
+        return content
 
     @classmethod
     def of(cls, content: object, where: str = "car.yml") -> "Car":

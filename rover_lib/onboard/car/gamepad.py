@@ -81,7 +81,8 @@ class Gamepad:
         None while the human has let go: L1 is up, the gamepad is gone or silent, after which L1 must be pressed again,
         or it is not known where a stick is. Never waits, raises nothing.
         """
-        now_s = time.monotonic() if now_s is None else now_s
+        if now_s is None:
+            now_s = time.monotonic()
         if self.gone:  # others may have the numbers of its files by now
             return None
         try:
@@ -137,7 +138,7 @@ class Gamepad:
 
 
 @dataclass(frozen=True)
-class Found:
+class GamepadDevice:
     """A gamepad that the kernel knows: the devices of its sticks and of its motion sensors, if it has any.
 
     identity: its own address, or where it is plugged in.
@@ -166,7 +167,7 @@ class Found:
             raise CarError(f"the gamepad {self} cannot be read ({error.strerror})", remedy=remedy) from error
 
 
-def list_gamepads(dev: Path = Path("/dev/input"), sys: Path = Path("/sys/class/input")) -> list[Found]:
+def list_gamepads(dev: Path = Path("/dev/input"), sys: Path = Path("/sys/class/input")) -> list[GamepadDevice]:
     """Return all devices that have L1 and both sticks, with the motion sensors of the same gamepad."""
 
     def text(node: Path, name: str) -> str:
@@ -188,11 +189,13 @@ def list_gamepads(dev: Path = Path("/dev/input"), sys: Path = Path("/sys/class/i
         if axes & both_axes == both_axes and keys >> BTN_L1 & 1:
             name = ascii(text(node, "name"))[1:-1][:60]
             identity = f"{name} {text(node, 'uniq') or text(node, 'phys')}"
-            gamepads.append(Found(name, dev / node.name, motion.get(whole[node]), identity))
+            gamepads.append(GamepadDevice(name, dev / node.name, motion.get(whole[node]), identity))
     return gamepads
 
 
-def open_gamepad(list_them: Callable[[], list[Found]] | None = None, *, again: Gamepad | None = None) -> Gamepad:
+def open_gamepad(
+    list_them: Callable[[], list[GamepadDevice]] | None = None, *, again: Gamepad | None = None
+) -> Gamepad:
     """Open the only gamepad that can be used, and wait up to OPEN_S for its first event.
 
     again: one that is gone; only the same one is opened, and nothing is waited for. Raises CarError.

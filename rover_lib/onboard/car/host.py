@@ -79,7 +79,6 @@ class Host:
         return [(sum(c) - c[3] - c[4], sum(c)) for c in cores if len(c) > 4] or None  # 3, 4: idle, waiting for disks
 
     def reading(self) -> dict[str, Any]:
-        """Return temperature, clock and throttling now."""
         return {"temperature_c": self.temperature_c(), "clock_mhz": self.clock_mhz(), "throttled": self.throttled()}
 
 

@@ -1,9 +1,5 @@
 """Check a picture from an untrusted source: the cost of decoding it, whether it is complete, and what it shows.
 
-    image = decode_jpeg(data)                  # CameraError: cut short, damaged, not a JPEG, or too large
-    mean, contrast = brightness(image)
-    same = (block_sums(image) == block_sums(before)).mean()
-
 OpenCV and Pillow decode a JPEG that was cut short and closed with an end marker, and only print a warning. simplejpeg
 reports the first warning, is as fast, and gives the same bits.
 """

@@ -102,6 +102,10 @@ class Telemetry:
         """Who drives and why, in words."""
         return f"{self.state.name.lower()}: {REASONS[self.reason]}"
 
+    def accepts(self, sequence: int) -> bool:
+        """Whether the Arduino has accepted the command with this number, or a later one."""
+        return (self.sequence - sequence) % SEQUENCES < SEQUENCES // 2
+
     @property
     def receiver(self) -> tuple[int | None, int | None, int | None, int | None]:
         """The transmitter's pulses of steering and throttle, and then their periods."""

@@ -4,11 +4,10 @@ A channel's pulse is a share ("duty") of its period: action = (duty% - neutral) 
 Throttle 0 means *stopped*, 120 us; it is not the middle of the throttle's range.
 """
 
-import contextlib
 import math
-import numbers
 from dataclasses import dataclass, field
 
+from rover_lib.onboard.checked import is_number
 from rover_lib.onboard.errors import CarError
 
 ARDUINO_STEP_US = 4  # resolution of micros() on a 16 MHz Arduino: no pulse is known better than this
@@ -17,10 +16,9 @@ NEUTRAL = (0.0, 0.0)  # (steering, throttle): straight and stopped
 
 def _finite(value: object, what: str) -> float:
     """Return `value` as a float. Raises CarError for None, strings, booleans, NaN and infinities."""
-    with contextlib.suppress(OverflowError):
-        if isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(number := float(value)):
-            return number
-    raise CarError(f"{what} must be a finite number", found=f"{type(value).__name__} {value!r}"[:80])
+    if not is_number(value):
+        raise CarError(f"{what} must be a finite number", found=f"{type(value).__name__} {value!r}"[:80])
+    return float(value)
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,6 @@ class Channel:
 
     @property
     def neutral_us(self) -> int:
-        """The pulse of action 0, in microseconds."""
         return self.pulse_us(0.0)
 
     def pulse_us(self, action: float) -> int:
@@ -123,7 +120,6 @@ class PwmCalibration:
         return Pulses(self.steering.pulse_us(steering), self.throttle.pulse_us(throttle))
 
     def neutral(self) -> Pulses:
-        """Return the pulses for "straight and stopped"."""
         return self.pulses(*NEUTRAL)
 
     def actions(self, *measured_us: float) -> tuple[float | None, float | None]:

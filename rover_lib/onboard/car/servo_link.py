@@ -28,7 +28,6 @@ from rover_lib.onboard.car.protocol import (
     LINE_MAX,
     MISSING,
     PROTOCOL_VERSION,
-    REASONS,  # noqa: F401, for those who show why
     RESULTS,
     SEQUENCES,
     Hello,
@@ -65,11 +64,6 @@ class LinkError(RoverError):
     """The Arduino is missing, speaks another protocol, refuses to be armed, or no longer answers."""
 
 
-def _reached(telemetry: Telemetry, sequence: int) -> bool:
-    """Whether the Arduino has accepted the command with this number, or a later one."""
-    return (telemetry.sequence - sequence) % SEQUENCES < SEQUENCES // 2
-
-
 def _keep(port: serial.Serial) -> None:
     """Keep others from opening the port, and closing it from changing DTR, whose edge resets an Arduino."""
     fcntl.ioctl(port.fileno(), termios.TIOCEXCL)  # for programs that know nothing of pyserial's lock
@@ -93,7 +87,8 @@ class ServoLink:
 
     def __init__(self, port: str, *, car: Car | None = None, clock: Callable[[], float] = time.monotonic):
         """port: "" means the only Arduino's. car: None means this machine's. Raises RoverError if either is unclear."""
-        self.port, self.car = port or find_port(), car or this_car()
+        self.port = port or find_port()
+        self.car = car or this_car()
         self.calibration = self.car.pwm
         self._clock = clock
         self._gamepad: Gamepad | None = None
@@ -244,7 +239,8 @@ class ServoLink:
         """
         hello = self.hello
         with self._heard:
-            before, self._requested = self._requested or self._telemetry, None
+            before = self._requested or self._telemetry
+            self._requested = None
         if hello and before and before.boot != hello.boot:
             raise LinkError(f"{self.port}: the Arduino was reset since the car was asked for", remedy="ask again")
         if hello and self._told_boot != hello.boot:
@@ -301,13 +297,15 @@ class ServoLink:
         end = self._clock() + ANSWER_S
         while self._clock() < end:
             number = self._send(kind, *values)
-            first = number if first is None else first
-            until, telemetry = self._clock() + REPEAT_S, None
+            if first is None:
+                first = number
+            until = self._clock() + REPEAT_S
+            telemetry = None
             while (rest_s := until - self._clock()) > 0:
                 self._await(lambda: self._telemetry is not telemetry, rest_s)  # noqa: B023
                 telemetry = self._telemetry
                 # An earlier status says nothing about the command.
-                if telemetry and _reached(telemetry, first) and telemetry.boot == self._boot:
+                if telemetry and telemetry.accepts(first) and telemetry.boot == self._boot:
                     yield telemetry
 
     def send(self, steering_us: int, throttle_us: int) -> int:
@@ -425,7 +423,8 @@ class ServoLink:
         heard = self._telemetry
         if not heard or heard.host_s != now or now - self._relayed_s < RELAY_EVERY_S:
             return
-        self._relayed_s, pulses_us = now, (0, 0)
+        self._relayed_s = now
+        pulses_us = (0, 0)
         if sticks := gamepad.sticks():
             channel = self.calibration.throttle
             # Also backwards on a car that cannot, and beyond a small cap: the Arduino judges the stick, then limits it.
@@ -456,9 +455,10 @@ class ServoLink:
                     self._unanswered.clear()
                 self.hello = message
             else:
-                before, self._telemetry = self._telemetry, message
+                before = self._telemetry
+                self._telemetry = message
                 if not before or (before.boot, before.state) != (message.boot, message.state):
                     self.turned = message
-                while self._unanswered and _reached(message, self._unanswered[0][0]):
+                while self._unanswered and message.accepts(self._unanswered[0][0]):
                     self._unanswered.popleft()
             self._heard.notify_all()

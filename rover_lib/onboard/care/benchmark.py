@@ -121,7 +121,6 @@ def _time_artifacts(paths: dict[str, str], threads: int, options: dict[str, Any]
 
 
 def _add_memory(metrics: dict[str, Any], paths: Mapping[str, Path], threads: int | None) -> None:
-    """Measure the memory of each artifact alone, and add it to the metrics."""
     with ThreadPoolExecutor(2) as pool:  # each process mostly imports, on one core
         peaks = pool.map(lambda path: peak_memory_alone_mb(path, threads=threads), paths.values())
         for name, peak_mb in zip(paths, peaks, strict=True):
@@ -153,7 +152,8 @@ class Timing:
     reference: str = ""
 
     def __post_init__(self) -> None:
-        names, unknown = list(self.policies), {self.main, self.reference} - {"", *self.policies}
+        names = list(self.policies)
+        unknown = {self.main, self.reference} - {"", *self.policies}
         if not names or not len(self.frames) or not self.iterations > 0 or unknown:
             what = f"a benchmark needs frames, iterations and policies, {self.main} and {self.reference} among them"
             raise ParamsError(what, found=f"{len(self.frames)}, {self.iterations} and {names}")
@@ -179,11 +179,13 @@ def benchmark(
     "supply_v", "artifacts": {name: {"p50_ms", "p95_ms", "n"}}} for each ten seconds, throttled with each bit that was
     set in them. began_s: by `wall`.
     """
-    policies, main = timing.policies, timing.main or next(iter(timing.policies))
+    policies = timing.policies
+    main = timing.main or next(iter(timing.policies))
     for policy in policies.values():
         for i in range(timing.warmup):
             policy.predict_chunk(timing.frames[i % len(timing.frames)], timing.state)
-    run, cores = _Run(timing, host or Host(), wall, cpu), usable_cores()
+    run = _Run(timing, host or Host(), wall, cpu)
+    cores = usable_cores()
     if timing.minutes:
         run.measure(itertools.count())
     else:
@@ -191,8 +193,10 @@ def benchmark(
     metrics = {
         **run.metrics_of(main),
         "peak_memory_mb": run.host.process_peak_memory_mb(),
-        "cpu_pct": 100 * run.process_s / run.wall_s / cores if run.wall_s > 0 else None,
-        **run.host_metrics(),
+        "cpu_pct": 100 * run.process_s / run.wall_s / cores,
+        "cpu_per_core_pct": run.per_core_pct,
+        **_heat_and_clock(run.readings),
+        "throttled": run.readings[-1]["throttled"],
         "main": main,
         "reference": timing.reference or None,
         "threads": getattr(policies[main], "threads", None),
@@ -263,7 +267,8 @@ class _Run:
 
         control_rate_hz: the highest rate at which 95 % of the inferences end within their period (1000 / p95).
         """
-        policy, times_ms = self.timing.policies[name], np.asarray(self.latencies_ms[name], float)
+        policy = self.timing.policies[name]
+        times_ms = np.asarray(self.latencies_ms[name], float)
         mean_ms, p95_ms = float(times_ms.mean()), float(np.percentile(times_ms, 95))
         manifest = getattr(policy, "manifest", None) or {}
         path = getattr(policy, "path", None)
@@ -274,8 +279,8 @@ class _Run:
             "latency_mean_ms": mean_ms,
             "latency_max_ms": float(times_ms.max()),
             "n": len(times_ms),
-            "throughput_fps": 1000 / mean_ms if mean_ms > 0 else math.inf,
-            "control_rate_hz": 1000 / p95_ms if p95_ms > 0 else math.inf,
+            "throughput_fps": 1000 / mean_ms,
+            "control_rate_hz": 1000 / p95_ms,
             "peak_memory_mb": None,
             "floor_ms": floor_ms(gmac, mode) if mode else None,
             "gmac": gmac,
@@ -289,13 +294,8 @@ class _Run:
             return {}
         times_ms, reference_ms = (np.asarray(self.latencies_ms[n]) for n in (name, self.timing.reference))
         p50_ms, reference_p50_ms = float(np.median(times_ms)), float(np.median(reference_ms))
-        low, high = np.percentile(reference_ms / np.maximum(times_ms, 1e-9), (5, 95)).tolist()
-        return {"speedup": reference_p50_ms / p50_ms if p50_ms > 0 else None, "speedup_p5": low, "speedup_p95": high}
-
-    def host_metrics(self) -> dict[str, Any]:
-        """Return the machine's state in the run: load of its cores, highest temperature, lowest clock, throttling."""
-        state = {"cpu_per_core_pct": self.per_core_pct, **_heat_and_clock(self.readings)}
-        return state | {"throttled": self.readings[-1]["throttled"]}
+        low, high = np.percentile(reference_ms / times_ms, (5, 95)).tolist()
+        return {"speedup": reference_p50_ms / p50_ms, "speedup_p5": low, "speedup_p95": high}
 
     def _read_host(self, passed_s: float) -> None:
         """Keep the host's state. Only a benchmark of minutes asks for the supply, by a process beside what is timed."""
@@ -318,7 +318,6 @@ class _Run:
 
 
 def _heat_and_clock(readings: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the highest temperature and the lowest clock."""
     temperatures_c = [r["temperature_c"] for r in readings if r["temperature_c"] is not None]
     clocks_mhz = [r["clock_mhz"] for r in readings if r["clock_mhz"] is not None]
     return {"temperature_c": max(temperatures_c, default=None), "clock_mhz": min(clocks_mhz, default=None)}

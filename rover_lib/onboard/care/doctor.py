@@ -1,8 +1,5 @@
 """Check everything that driving needs, and say in one line each what was found and what to do about it.
 
-    for check in examine("policy_static.pt", camera="0"):
-        print(check)
-
 "fail" means that the car would not drive, "warning" that it would drive worse or stop more often than it could.
 """
 
@@ -81,10 +78,12 @@ def examine(
 
     artifact: the policy to check. camera, port: as for `rover drive`. log_folder: where flight logs go [this folder].
     """
-    host, manifest = host or Host(), None
+    host = host or Host()
+    manifest = size = None
     with contextlib.suppress(ArtifactError, OSError):  # the artifact's own check reports it
-        manifest = read_manifest(artifact) if artifact else None
-    size = seen_size(manifest) if manifest else None
+        if artifact:
+            manifest = read_manifest(artifact)
+            size = seen_size(manifest)
     device = path_of(str(camera))
     checks: dict[str, Callable[[], Iterable[Check]]] = {}
     if device.is_relative_to(DEV):  # otherwise it is a file or a pipe, and no camera needs to be there
@@ -136,7 +135,9 @@ def camera_rate(source: Path | str, seen: tuple[int, int] | None = None, *, rate
         if seen:
             check_shape(str(source), last.image, seen)
     number = last.number - first.number
-    measured_hz = number / (last.captured_s - first.captured_s) if number and last.captured_s > first.captured_s else 0
+    measured_hz = 0.0
+    if last.captured_s > first.captured_s:
+        measured_hz = number / (last.captured_s - first.captured_s)
     height, width = last.image.shape[:2]
     finding = f"{source}: {width}x{height}, {clock} time stamps, {measured_hz:.1f} frames a second"
     settings = Settings.of(params()["drive"])
@@ -152,7 +153,6 @@ def camera_rate(source: Path | str, seen: tuple[int, int] | None = None, *, rate
 
 
 def _newest_after(camera: Any, seconds: float) -> Frame:
-    """Watch a camera for a while, and return its last frame."""
     end, last = time.monotonic() + seconds, camera.latest()
     while (rest_s := end - time.monotonic()) > 0 and (frame := camera.wait(last.number, rest_s)):
         last = frame
@@ -184,7 +184,8 @@ def _transmitter(link: ServoLink) -> Check:
         return Check("transmitter", "fail", finding, remedy)
     finding = f"steering {steering_us} us, throttle {throttle_us} us"
     rests = abs(throttle_us - link.calibration.throttle.pulse_us(0.0)) <= REST_US
-    finding += "" if rests else ": arming will be refused"
+    if not rests:
+        finding += ": arming will be refused"
     return warn_unless(rests, "transmitter", finding, "let go of the throttle")
 
 

@@ -1,9 +1,5 @@
 """Releases of the policy on the rover. Switching is atomic, even if the power fails at any moment.
 
-    releases = Releases("/var/lib/rover/models")
-    name = releases.stage("policy_static.pt").name
-    releases.switch(name)                             # checked before and after; rolls back by itself
-
     models/current              a symbolic link to releases/<content hash>, and the only truth about what is in use
     models/releases/<hash>/     policy.pt, and release.json: its SHA-256, and where it came from
     models/history.json         what was in use, the newest last; for rollback and prune
@@ -33,7 +29,6 @@ from rover_lib.onboard.durable import sync
 from rover_lib.onboard.errors import RoverError, printable
 from rover_lib.onboard.stage import private_lock, sha256_of
 
-MODELS = Path("/var/lib/rover/models")
 POLICY, ORIGIN = "policy.pt", "release.json"
 NAME = re.compile(r"[0-9a-f]{64}")
 SPARE_BYTES = 64 << 20  # left free for logs
@@ -59,14 +54,12 @@ class Releases:
     stays in use, unless the error says otherwise.
     """
 
-    def __init__(self, models: Path | str = MODELS, *, check: Check | None = None, expected: Expected = THIS_CAR):
+    def __init__(self, models: Path | str, *, check: Check | None = None, expected: Expected = THIS_CAR):
         self.models = Path(models)
         self.releases = self.models / "releases"
         self.current_link = self.models / "current"
         self.expected = expected
         self.check = check or self.verify
-
-    # Questions
 
     @property
     def current(self) -> str | None:
@@ -91,7 +84,10 @@ class Releases:
         return self._look_at(name)["wrong"]
 
     def _look_at(self, name: str) -> dict[str, Any]:
-        policy, origin, megabytes, wrong = self.releases / name / POLICY, {}, 0.0, ""
+        policy = self.releases / name / POLICY
+        origin: Any = {}
+        megabytes = 0.0
+        wrong = ""
         try:
             megabytes = round(policy.stat().st_size / 1e6, 1)
             origin = json.loads(policy.with_name(ORIGIN).read_text())
@@ -110,7 +106,9 @@ class Releases:
         releases: name, current, mode, origin, sha256, megabytes and wrong of each, the last used first. since: when
         `current` was switched. healthy: whether the bytes of the release in use are intact; if not, trouble says why.
         """
-        releases, current, since = [self._look_at(name) for name in self._by_use()], self.current, None
+        releases = [self._look_at(name) for name in self._by_use()]
+        current = self.current
+        since = None
         none = f"current points to {current}, not to a release" if current else "no model: deploy one"
         in_use = next((r for r in releases if r["current"]), {"mode": None, "wrong": none})
         with contextlib.suppress(OSError):
@@ -126,26 +124,19 @@ class Releases:
             "disk_free_mb": round(shutil.disk_usage(nearest).free / 1e6),
         }
 
-    def verify(self, name: str = "current", confined: bool = False) -> None:
-        """Check that a release's bytes are intact, and that it computes correctly here (parity vectors).
+    def verify(self, name: str = "current") -> None:
+        """Check that a release's bytes are intact, and that it computes correctly here (parity vectors), confined.
 
-        confined: in a process that has given up every right that no inference needs. Raises RoverError.
+        Raises RoverError.
         """
+        from rover_lib.onboard.policy.confined import run_confined
+
         path = self.path_of(name)
         if not path.exists():
             raise RoverError(f"{path}: not there", remedy="deploy one" if name == "current" else "stage it again")
         if wrong := self.wrong_with(path.parent.resolve().name):
             raise RoverError(f"{path}: {wrong}", remedy="deploy it again")
-        if confined:
-            from rover_lib.onboard.policy.confined import run_confined
-
-            run_confined(load_only, path=str(path))
-        else:
-            from rover_lib.onboard.policy.load import load_policy
-
-            load_policy(path)
-
-    # Changes
+        run_confined(load_only, path=str(path))
 
     def stage(
         self, source: Path | str, *, sha256: str | None = None, origin: str | None = None, allow: Iterable[str] = ()
@@ -252,8 +243,6 @@ class Releases:
             if removed:
                 self._write_history([name for name in self._history() if name not in removed])
             return removed
-
-    # How
 
     @contextlib.contextmanager
     def _lock(self) -> Iterator[None]:

@@ -1,8 +1,4 @@
-"""A whole drive: open all devices in order, arm and drive (session.py), and close everything in reverse order.
-
-report = Report()
-drive_car(DriveOptions(artifact=Path("policy_static.pt"), camera="0", port="/dev/ttyUSB0"), report)
-"""
+"""A whole drive: open all devices in order, arm and drive (session.py), and close everything in reverse order."""
 
 import contextlib
 import logging

@@ -1,8 +1,5 @@
 """The drive's end of the view: it sends what the view shows, and accepts one request, a stop.
 
-    feed = Feed(place, log, title="policy_static.pt")
-    drive(..., until=Until(over=feed.over), hooks=Hooks(show=partial(feed.tick, report, camera, pilot)))
-
 The view is another process; on a rover, another user runs it. It listens at a Unix socket that transports whole
 messages. Neither side waits for the other: a message is dropped while the previous one has not been read, so that a
 view that hangs, floods or dies costs a drive no more than a failed system call.
@@ -108,7 +105,9 @@ class Feed:
         now_s = self._clock()
         if now_s < self._due_s:
             return False
-        self._due_s = (self._due_s if now_s < self._due_s + EVERY_S else now_s) + EVERY_S
+        if now_s >= self._due_s + EVERY_S:
+            self._due_s = now_s
+        self._due_s += EVERY_S
         return self._connected()
 
     def _connected(self) -> bool:
@@ -151,10 +150,9 @@ class Feed:
             return False
 
     def _picture(self, camera: Camera) -> tuple[dict[str, Any], bytes]:
-        try:
+        frame = None
+        with contextlib.suppress(RoverError):  # whoever needs the camera reports that it is gone
             frame = camera.latest()
-        except RoverError:  # whoever needs the camera reports that it is gone
-            frame = None
         if frame is None:
             return {}, b""
         height, width = frame.image.shape[:2]
@@ -165,7 +163,9 @@ class Feed:
         """Give the view a message unless it has not read the previous one. Never waits."""
         try:
             if self._socket and not struct.unpack("i", fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4)))[0]:
-                self._socket.send(line + picture if len(line) + len(picture) < MOST_BYTES else line)
+                if len(line) + len(picture) < MOST_BYTES:
+                    line += picture
+                self._socket.send(line)
                 return True
         except BlockingIOError:
             pass

@@ -1,10 +1,5 @@
 """The flight log: one line of JSON per control tick, written without ever holding up the loop.
 
-    with FlightLog(path, header={"hz": 30, "fade_s": 0.5, "stop_s": 1.0}, max_bytes=10_000_000, keep=3) as log:
-        log.tick(Tick(t_s=time.monotonic() - log.start_s, ...))
-        log.event("camera unplugged", level=logging.WARNING)
-    flight = read_log(path)
-
 Each file begins with a header, which names the columns of the ticks. A tick is an array of values, null if unknown;
 all else are objects. The reader skips a line that a power cut or a full disk has cut short.
 """
@@ -56,7 +51,7 @@ class Tick(NamedTuple):
     t_s: float  # since FlightLog.start_s, by the same clock
     late_ms: float  # how long after its deadline the command went out
     state: str  # who drives: M, A or S as the Arduino says, "" if not known
-    reason: str  # why, a key of servo_link.REASONS
+    reason: str  # why, a key of protocol.REASONS
     steering: float  # commanded, [-1, 1]
     throttle: float  # commanded, [0, 1]
     steering_us: int  # commanded pulses
@@ -110,12 +105,16 @@ class FlightLog:
         clock: Callable[[], float] = time.monotonic,
         host: Host | None = None,
     ):
-        self.path, self.start_s = Path(path), clock()
+        self.path = Path(path)
+        self.start_s = clock()
         self.recent: deque[Event] = deque(maxlen=RECENT)
         self.machine: dict[str, Any] = {}  # its newest state: t_s, temperature_c, throttled
         start = {"start": datetime.now().astimezone().isoformat(), "start_monotonic_s": self.start_s}
         self._header = {"schema": SCHEMA, "kind": "header", **start, "columns": Tick._fields, "drive": header}
-        self._max_bytes, self._keep, self._clock, self._host = max_bytes, keep, clock, host or Host()
+        self._max_bytes = max_bytes
+        self._keep = keep
+        self._clock = clock
+        self._host = host or Host()
         self._rows: deque[Tick | Event | dict[str, Any]] = deque(maxlen=QUEUE_ROWS)
         self._lock: BaseFileLock | None = None
         self._closing = threading.Event()
@@ -173,7 +172,8 @@ class FlightLog:
                 self._reader.join(CLOSE_S / 4)  # for its last row
             try:
                 if not self._lines:  # while the disk takes nothing, the queue drops the oldest
-                    self._collect()
+                    for _ in range(len(self._rows)):
+                        self._lines.append(_line(self._rows.popleft()))
                 self._write_lines()
                 if failed:
                     self.event("the flight log is written again", level=logging.WARNING)
@@ -186,7 +186,6 @@ class FlightLog:
         self._close_file()
 
     def _read_machine(self) -> None:
-        """Read the machine's state about once a second."""
         while True:
             now_s = self._clock() - self.start_s
             vcgencmd = shutil.which(self._host.vcgencmd)  # never start a program that is not there
@@ -196,13 +195,8 @@ class FlightLog:
             if self._closing.wait(SYNC_S):
                 return
 
-    def _collect(self) -> None:
-        """Make lines of the rows that have come."""
-        for _ in range(len(self._rows)):
-            self._lines.append(_line(self._rows.popleft()))
-
     def _write_lines(self) -> None:
-        """Write what was collected, and sync it to the disk. Raises OSError."""
+        """Write the lines, and sync them to the disk. Raises OSError."""
         file = self._file or self._open()
         while self._lines:
             if file.tell() >= self._max_bytes:
@@ -383,7 +377,8 @@ def _row(line: bytes) -> list[Any] | Event | tuple[Any, ...] | dict[str, Any] | 
                 return Event(float(t_s), text)
             case {"kind": "machine", "t_s": t_s, "temperature_c": heat, "throttled": bits} if is_number(t_s):
                 valid = (heat is None or is_number(heat)) and (bits is None or THROTTLED_VALUE.fullmatch(bits))
-                return (float(t_s), heat, bits) if valid else None
+                if valid:
+                    return (float(t_s), heat, bits)
             case {"kind": "header", "schema": schema, "drive": dict()} as header if schema == SCHEMA:
                 return header
     except (ValueError, TypeError, RecursionError):

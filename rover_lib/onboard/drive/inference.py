@@ -155,10 +155,13 @@ class PolicyProcess:
     """
 
     def __init__(self, artifact: Path | str | Artifact, *, threads: int | None = None):
-        self._source, self.artifact = artifact, artifact.path if isinstance(artifact, Artifact) else Path(artifact)
+        self._source = artifact
+        self.artifact = artifact.path if isinstance(artifact, Artifact) else Path(artifact)
         self.threads = threads or max(1, (os.cpu_count() or 1) - 1)
         self.manifest: dict[str, Any] = {}
-        self.rate_hz, self.chunk, self.unconfined = 0.0, 0, ""
+        self.rate_hz = 0.0
+        self.chunk = 0
+        self.unconfined = ""
         self.strange: float | None = None
         self._process: SpawnProcess | None = None
         self._pipe: Connection | None = None

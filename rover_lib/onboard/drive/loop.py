@@ -1,8 +1,5 @@
 """The control loop: it sends a command at each absolute deadline, and every fault ends in a stopped car.
 
-    with ServoLink(port) as link:
-        report = drive(pilot, link, log, rate_hz=30, until=Until(max_seconds=60))
-
 Whatever ends the loop, the next command is neutral. If that does not get through, the Arduino stops the car by itself
 150 ms after the last command.
 """
@@ -17,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rover_lib.onboard.car.car import this_car
-from rover_lib.onboard.car.protocol import SEQUENCES, State, Telemetry
+from rover_lib.onboard.car.protocol import State, Telemetry
 from rover_lib.onboard.car.servo_link import LATE_S, LinkError, ServoLink
 from rover_lib.onboard.drive.flight_log import ARMED, FlightLog, Tick, figures
 from rover_lib.onboard.drive.pilot import Order, Pilot
@@ -117,7 +114,7 @@ def drive(
     """
     if not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
         raise ParamsError(f"a car is driven at {RATES_HZ[0]:g} to {RATES_HZ[1]:g} Hz", found=f"{rate_hz:g}")
-    report = report if report is not None else Report()
+    report = report or Report()
     until = until or Until()
     loop = _Loop(pilot, link, log, 1 / rate_hz, until, hooks or Hooks(), report, clock, sleep)
     pilot.ready(until.stop)
@@ -139,7 +136,8 @@ def drive(
         log.event(f"ended: {report.ended}")
     finally:
         log.event(stopped)
-        report.seconds = clock() - loop.start_s if loop.start_s else 0.0
+        if loop.start_s:
+            report.seconds = clock() - loop.start_s
     return report
 
 
@@ -165,8 +163,13 @@ class _Loop:
     port_stuck: bool = False  # the port did not take the last command
 
     def arm(self) -> None:
-        telemetry = (self.hooks.arm or (self.link.arm if self.link else lambda: None))()
-        self.boot = telemetry.boot if telemetry else 0
+        telemetry = None
+        if self.hooks.arm:
+            telemetry = self.hooks.arm()
+        elif self.link:
+            telemetry = self.link.arm()
+        if telemetry:
+            self.boot = telemetry.boot
         self.armed = True
         self.log.event(ARMED if self.link else "dry run: no motor is driven")
 
@@ -232,7 +235,7 @@ class _Loop:
             self.sleep(max(0.0, again - self.clock()))
             try:
                 telemetry = link.latest()
-                if telemetry and (telemetry.sequence - self.sequence) % SEQUENCES < SEQUENCES // 2:
+                if telemetry and telemetry.accepts(self.sequence):
                     if (again := self.sent_s + KEEP_S) >= deadline - SPARE_S:
                         break
                     self.sleep(max(0.0, again - self.clock()))

@@ -31,7 +31,8 @@ class Motion:
         passed_s = frame.captured_s - self._judged_s
         if not self.stuck_s or passed_s < EVERY_S:
             return
-        self._judged_s, passed_s = frame.captured_s, min(passed_s, GAP_S)
+        self._judged_s = frame.captured_s
+        passed_s = min(passed_s, GAP_S)
         self._off_s = 0.0 if abs(throttle) > DRIVEN else self._off_s + passed_s
         if self._off_s > self.stuck_s:  # a car that brakes for a moment may still be stuck, one that waits is not
             self._before = None

@@ -85,7 +85,8 @@ class Sight:
         self._throttle = throttle
         if abs(throttle) > MOVING:
             self._throttle_s = at_s
-            self._moving_s = at_s if self._moving_s is None else self._moving_s
+            if self._moving_s is None:
+                self._moving_s = at_s
         elif at_s - self._throttle_s > COASTS_S:
             self._moving_s = None
 
@@ -106,7 +107,8 @@ class Sight:
         if not fault:
             self._blank_s = None
             return
-        self._blank_s = frame.captured_s if self._blank_s is None else self._blank_s
+        if self._blank_s is None:
+            self._blank_s = frame.captured_s
         if frame.captured_s - self._blank_s >= (self._settings.black_frames - 1.5) / self._camera.wanted_hz:
             raise fault
 
@@ -187,7 +189,9 @@ class PolicyPilot:
 
     def warnings(self) -> Iterator[str]:
         """Yield sentences about how late camera and policy were since the last call."""
-        age_s, asking_s, plan = self._frame_age_s, self._asking_s, self._follower.plan
+        age_s = self._frame_age_s
+        asking_s = self._asking_s
+        plan = self._follower.plan
         self._frame_age_s = self._asking_s = 0.0
         if self._cut > CUT and not self._said_cut:
             self._said_cut, limit = True, self._settings.throttle_limit

@@ -123,9 +123,11 @@ class Plan:
     def at(self, step: float) -> np.ndarray:
         """Return the (2,) [steering, throttle] meant for `step` steps after the first, interpolated; it ends held."""
         step = min(max(step, 0.0), len(self.actions) - 1.0)
-        i = min(int(step), len(self.actions) - 2) if len(self.actions) > 1 else 0
+        i = min(int(step), max(0, len(self.actions) - 2))
         share = step - i
-        return self.actions[i] if share == 0 else (1 - share) * self.actions[i] + share * self.actions[i + 1]
+        if share == 0:
+            return self.actions[i]
+        return (1 - share) * self.actions[i] + share * self.actions[i + 1]
 
 
 @dataclass(frozen=True)
@@ -193,7 +195,9 @@ class Follower:
 
     def stop_s(self) -> float:
         """Return the age in seconds at which the newest plan stops the car: the settings', or the chunk's end."""
-        return min(self.settings.stop_s, len(self.plan.actions) / self.rate_hz) if self.plan else 0.0
+        if not self.plan:
+            return 0.0
+        return min(self.settings.stop_s, len(self.plan.actions) / self.rate_hz)
 
     def command(self, now_s: float) -> Command | None:
         """Return what the newest plan meant for now; None without a plan, or if it is too old to drive by.

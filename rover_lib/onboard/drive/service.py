@@ -67,7 +67,8 @@ class Request:
 
 def check_age(age_s: float, most_s: float | None = None) -> None:
     """Raise RoverError for a request that is too old: whoever sent it may no longer be watching the car."""
-    most_s = REQUEST_S if most_s is None else most_s
+    if most_s is None:
+        most_s = REQUEST_S
     if not 0 <= age_s <= most_s:  # also refuses NaN, and a time that has not come yet
         problem = f"{age_s:.1f} s have passed since the car was asked for, at most {most_s:g} may"
         raise RoverError(problem, remedy="ask again", kind="not armed")
@@ -146,7 +147,9 @@ class Service:
         each raises if its device fails. missing: what must be done before the car can be armed, "" if nothing. said:
         how the previous drive ended. Raises RoverError when told to stop, and what a check raises.
         """
-        first, self._state, self._text = not self._rounds, DISARMED, ""
+        first = not self._rounds
+        self._state = DISARMED
+        self._text = ""
         while not self._stop.is_set():
             for check in checks:
                 check()
@@ -201,11 +204,10 @@ class Service:
     def _reply(self, **answer: Any) -> None:
         """Answer the request that was tried. A refused one has used up its ticket."""
         with self._turn:
-            self._asked, self._answer = False, answer
+            self._asked = False
+            self._answer = answer
             self._ticket = "" if answer["armed"] else secrets.token_hex(8)
             self._turn.notify_all()
-
-    # ---- operators
 
     def _listen(self) -> None:
         while not self._done.is_set():
@@ -228,7 +230,10 @@ class Service:
                 return self._text or "it is not ready"
             if ticket != self._ticket:
                 return "the service was started or tried again meanwhile: ask anew"
-            self._ticket, self._request, self._asked, self._answer = "", request, True, None
+            self._ticket = ""
+            self._request = request
+            self._asked = True
+            self._answer = None
             self._asked_s, self._hung_up = asked_s, hung_up
             self._turn.notify_all()
         return ""
@@ -251,10 +256,10 @@ class Service:
                     return self._answer or {}
         return {"armed": False, "text": "the service has ended"}
 
-    # ---- systemd
-
     def _feed(self) -> None:
-        number, ended, told_s = -1, 0, 0.0
+        number = -1
+        ended = 0
+        told_s = 0.0
         while not self._done.wait(FEED_S):
             if self._report.ended and self._stop.is_set():
                 return self._stopping(self._report.ended)

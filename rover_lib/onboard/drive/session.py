@@ -37,13 +37,9 @@ TAKEN_OVER = "the human drives, and is recorded until the sticks are let go"
 
 @dataclass(frozen=True)
 class DriveOptions:
-    """The options of `rover drive`.
+    """The options of `rover drive`, whose help explains them. None: as there.
 
-    hz: commands per second. dry_run: no motor is driven. record: folder in which an episode is written. record_mb: how
-    much all episodes in it may take together; None: limited by the disk. max_seconds, ticks: when to end.
-    throttle_limit: replaces that of params.yml. threads: of the policy; None: all cores but one. log_file: None: the
-    user's. service: run as a systemd service, disarmed until a human arms it. latency_ms: make each plan take at least
-    this long, for comparisons. view: the socket of a view; None: the user's. asked_s: when the car was asked for, by
+    latency_ms: make each plan take at least this long, for comparisons. asked_s: when the car was asked for, by
     boottime().
     """
 
@@ -134,11 +130,16 @@ class Session:
 
     def over(self) -> str | None:
         """Why this drive must end, by its operator or the view; None if it may go on."""
-        return (self.service.over() if self.service else None) or self.feed.over()
+        if self.service and (reason := self.service.over()):
+            return reason
+        return self.feed.over()
 
     def check_wanted(self) -> None:
         """Raise RoverError if whoever asked for the car did so too long ago, or is gone."""
-        (self.service.check_request if self.service else wanted_since(self.options.asked_s, self.now))()
+        if self.service:
+            self.service.check_request()
+        else:
+            check_age(self.now() - self.options.asked_s, WAIT_S)
 
     def _arm(self, arming: "Arming", stop: threading.Event, said: str) -> Telemetry | None:
         """Arm the car for whoever asks for it: a service's operator, or the command itself."""
@@ -165,20 +166,19 @@ class Session:
         return self.feed.over()
 
 
-class Arming:
+class Arming(AbstractContextManager["Arming"]):
     """Prepares a drive and arms the car; a context manager, whose end finishes the episode and lowers the priority."""
 
     def __init__(self, session: Session, pilot: PolicyPilot):
-        self._session, self._pilot, options = session, pilot, session.options
+        self._session = session
+        self._pilot = pilot
+        options = session.options
         self._room: int | None = None
         if options.record and options.record_mb:
             self._room = room_for(options.record, options.record_mb)  # now, because it may take a while
         self._recorder: TakeoverRecorder | None = None
         self._armed: Telemetry | None = None
         self._driving, self._opened = ExitStack(), ExitStack()  # the second contains the first
-
-    def __enter__(self) -> "Arming":
-        return self
 
     def __exit__(self, *exc: Any) -> None:
         if self._recorder:
@@ -225,23 +225,15 @@ class Arming:
         recorder, log = self._recorder.recorder, session.log
         log.event(TAKEN_OVER)
         try:
-            options: dict[str, Any] = {
-                "rate_hz": session.options.hz,
-                "stop": stop,
-                "over": over,
-                "clock": session.clock,
-            }
-            takeover = self._recorder.human(session.link, self._armed, **options)
+            rate_hz = session.options.hz
+            takeover = self._recorder.human(
+                session.link, self._armed, rate_hz=rate_hz, stop=stop, over=over, clock=session.clock
+            )
             recorder.note(takeover=vars(takeover))
             log.event(str(takeover))
             recorder.close(takeover.ended if takeover.fault else None)
         except Exception as error:
             log.event(f"the human is not recorded: {sentence_of(error)}", level=logging.ERROR)
-
-
-def wanted_since(asked_s: float, clock: Callable[[], float] = boottime) -> Callable[[], None]:
-    """Return a check for a car that was asked for at asked_s: it raises once that is over WAIT_S ago."""
-    return lambda: check_age(clock() - asked_s, WAIT_S)
 
 
 def arm_when_ready(
@@ -257,7 +249,8 @@ def arm_when_ready(
     checks: called while waiting; each raises if its device fails. still_wanted: raises if the human asked too long ago;
     None: they ask now. Raises RoverError when told to stop.
     """
-    still_wanted = still_wanted or wanted_since(boottime())
+    asked_s = boottime()
+    still_wanted = still_wanted or (lambda: check_age(boottime() - asked_s, WAIT_S))
     link.request()
     message = ""
     while missing := what_is_missing(link):
@@ -276,7 +269,9 @@ def arm_when_ready(
 def what_is_missing(link: ServoLink) -> str:
     """Return what a human must do before the Arduino can be armed, "" if nothing. Raises LinkError."""
     telemetry = link.latest()
-    return link.remedy(telemetry.missing) if telemetry and telemetry.missing != "-" else ""
+    if not telemetry or telemetry.missing == "-":
+        return ""
+    return link.remedy(telemetry.missing)
 
 
 def arm_capped(

@@ -1,10 +1,5 @@
 """Record a drive as an episode: the policy's commands and, after a takeover, what the human does.
 
-    recorder = TakeoverRecorder(Recorder(...), mode="static")
-    hooks = Hooks(record=recorder.command)
-    ...                                              # the loop ends with DriveFault, and the car is disarmed
-    takeover = recorder.human(link, armed, rate_hz=30, stop=stop)
-
 After the takeover the human has the car: this module only reads and records the Arduino's statuses, and sends nothing.
 Each control has a column `driver`, one of recording.DRIVERS. A human's pulses are those of the receiver; if the pins
 differ from it (the throttle is blocked, or the signal was lost), the driver is "nobody".
@@ -91,7 +86,9 @@ class TakeoverRecorder:
         """
         start_s = heard_s = signal_s = clock()
         rest_s: float | None = None  # since when both sticks have been at rest
-        counts, boot, tick = dict.fromkeys((HUMAN, NOBODY), 0), None, 0
+        counts = dict.fromkeys((HUMAN, NOBODY), 0)
+        boot = None
+        tick = 0
         neutral = link.calibration.neutral()
         rest_us = armed.receiver_steering_us or neutral.steering_us, neutral.throttle_us
         first = link.turned  # the status that ended the policy's turn
@@ -112,7 +109,8 @@ class TakeoverRecorder:
                     continue
                 if boot not in (None, telemetry.boot):
                     return ended("the Arduino was reset", fault=True)
-                boot, heard_s = telemetry.boot, max(heard_s, telemetry.host_s)
+                boot = telemetry.boot
+                heard_s = max(heard_s, telemetry.host_s)
                 driver = driver_by(telemetry)
                 counts[driver] += 1
                 self._last_s = telemetry.host_s

@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
@@ -112,60 +113,60 @@ def exit_if_hung(report: Report, log: FlightLog) -> Iterator[None]:
         done.set()
 
 
+@dataclass
 class HealthWatch:
     """A source of warnings, for loop.Hooks: a sentence for each thing that was unusual since the last call.
 
     log: one of its threads reads the supply and the heat, for the loop must not wait for that. undervoltage_s: after
-    this time a supply that is too low raises DriveFault; 0: never.
+    this time a supply that is too low raises DriveFault; 0: never. low_s: since when it has been too low. warning: the
+    last one of supply and heat. counts: of the link, at the last call.
     """
 
-    def __init__(
-        self,
-        report: Report,
-        link: ServoLink | None,
-        log: FlightLog,
-        undervoltage_s: float,
-        clock: Callable[[], float] = time.monotonic,
-    ):
-        self._report, self._link, self._log = report, link, log
-        self._undervoltage_s, self._clock = undervoltage_s, clock
-        self._ticks = 0
-        self._counted: tuple[int, ...] | None = None
-        self._low_s: float | None = None  # since when the supply has been too low
-        self._said: str | None = None  # of supply and heat
+    report: Report
+    link: ServoLink | None
+    log: FlightLog
+    undervoltage_s: float
+    clock: Callable[[], float] = time.monotonic
+    ticks: int = 0
+    counts: tuple[int, ...] | None = None
+    low_s: float | None = None
+    warning: str | None = None
 
     def __call__(self) -> Iterator[str]:
         yield from self._of_the_supply()
-        late_ms, self._ticks = max(self._report.late_ms[self._ticks :], default=0.0), len(self._report.late_ms)
+        late_ms = max(self.report.late_ms[self.ticks :], default=0.0)
+        self.ticks = len(self.report.late_ms)
         if late_ms > LATE_COMMAND_MS:
             yield f"commands were up to {late_ms:.1f} ms late"
         with contextlib.suppress(LinkError):  # the next tick handles it
-            if self._link and (telemetry := self._link.latest()):
-                yield from self._of_the_link(self._link.garbled, telemetry)
+            if self.link and (telemetry := self.link.latest()):
+                yield from self._of_the_link(self.link.garbled, telemetry)
 
     def _of_the_supply(self) -> Iterator[str]:
-        if not (machine := self._log.machine):  # it has not been read yet
+        if not (machine := self.log.machine):  # it has not been read yet
             return
-        old = self._clock() - self._log.start_s - machine["t_s"] > OLD_S
+        old = self.clock() - self.log.start_s - machine["t_s"] > OLD_S
         now = throttled_means(None if old else machine["throttled"], since_the_start=False)
         slow = "; plans take longer" if set(now or ()) - {UNDER_VOLTAGE} else ""
-        self._report.machine = ", ".join(now or ()) + slow
-        supply = NOT_REPORTED if now is None else self._report.machine
-        if supply and supply != self._said:
-            yield supply
-        self._said = supply
+        self.report.machine = ", ".join(now or ()) + slow
+        warning = NOT_REPORTED if now is None else self.report.machine
+        if warning and warning != self.warning:
+            yield warning
+        self.warning = warning
         if now is None:
             return  # unknown: neither low nor good again
         if UNDER_VOLTAGE not in now:
-            self._low_s = None
+            self.low_s = None
             return
-        self._low_s = self._clock() if self._low_s is None else self._low_s
-        if self._undervoltage_s and (low_s := self._clock() - self._low_s) >= self._undervoltage_s:
+        if self.low_s is None:
+            self.low_s = self.clock()
+        if self.undervoltage_s and (low_s := self.clock() - self.low_s) >= self.undervoltage_s:
             raise DriveFault(f"{UNDER_VOLTAGE} for {low_s:.0f} s", remedy="charge the battery")
 
     def _of_the_link(self, garbled: int, t: Telemetry) -> Iterator[str]:
-        counts = (self._report.resent, garbled, t.bad_lines, t.old_commands, t.out_of_range, t.lost_bytes)
-        before, self._counted = self._counted or counts, counts
+        counts = (self.report.resent, garbled, t.bad_lines, t.old_commands, t.out_of_range, t.lost_bytes)
+        before = self.counts or counts
+        self.counts = counts
         # An Arduino that was reset counts from 0 again.
         news = (now - then if now >= then else now for now, then in zip(counts, before, strict=True))
         again, garbled, bad, old, beyond, lost = news

@@ -1,7 +1,5 @@
 """Confine a process that runs an artifact: it may compute, read files, and answer through files that it has open.
 
-    reason = confine(memory_mb("policy_static.pt", threads=3))    # "" if the kernel enforces it, otherwise why not
-
 Nobody can tell what an artifact's program does. So before a process runs it, it gives up every right that a policy does
 not need: it can no longer open a file for writing, the serial port or a socket, start a program, or touch another
 process, and its memory has a limit. libseccomp makes the kernel's filter of system calls.
@@ -106,5 +104,6 @@ def forbid_opening() -> None:
 
 def _lower(limit: int, value: int) -> None:
     maximum = resource.getrlimit(limit)[1]
-    value = value if maximum == resource.RLIM_INFINITY else min(value, maximum)
+    if maximum != resource.RLIM_INFINITY:
+        value = min(value, maximum)
     resource.setrlimit(limit, (value, value))

@@ -1,7 +1,6 @@
 """Load artifacts only in a process that has confined itself: whoever made them, they cannot do harm there.
 
-metrics = run_confined(time_artifacts, paths={"static": "policy_static.pt"}, ...)     # in a process of its own
-policies = load_confined(paths, threads=3)                                            # in time_artifacts
+run_confined() starts a process of its own, whose function calls load_confined().
 """
 
 import importlib
@@ -53,7 +52,8 @@ def load_confined(
     artifacts = {name: Artifact(path) for name, path in paths.items()}
     for artifact in artifacts.values():
         import_engine(artifact)
-    errors, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    errors = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
     for standard in (1, 2):
         os.dup2(nowhere, standard)
     if reason := confine(sum(memory_mb(path, threads) for path in paths.values())):

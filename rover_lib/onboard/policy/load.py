@@ -58,7 +58,6 @@ class Policy:
         self.cameras: tuple[str, ...] = tuple(c["name"] for c in manifest["cameras"])
         self.chunk: int = manifest["chunk"]
         self.rate_hz = float(manifest["rate_hz"])
-        self.image_size: tuple[int, int] = (manifest["cameras"][0]["height"], manifest["cameras"][0]["width"])
         self._engine, self.familiar = engine, familiar
         self.strange: float | None = None
         self.car = car_of(manifest)

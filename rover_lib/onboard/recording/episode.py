@@ -110,7 +110,8 @@ class EpisodeWriter:
         self._rows: dict[str, FileIO] = {}
         self._damaged: set[Any] = set()  # pictures that a kill or a power cut has left without their end
         self._left_out = 0  # damaged rows and pictures
-        self._closing, self._syncing = threading.Event(), threading.Thread(target=self._keep_synced, daemon=True)
+        self._closing = threading.Event()
+        self._syncing = threading.Thread(target=self._keep_synced, daemon=True)
         self._unsynced: OSError | None = None
 
     def __enter__(self) -> "EpisodeWriter":
@@ -241,7 +242,9 @@ class EpisodeWriter:
             shutil.rmtree(self._part, ignore_errors=True)
         if self._lock is not None:
             os.close(self._lock)
-        self._rows, self._part, self._lock = {}, None, None
+        self._rows = {}
+        self._part = None
+        self._lock = None
 
     def _take(self, part: Path, lock: int) -> None:
         """Go on with what an ended process has left in a hidden folder."""
@@ -263,7 +266,8 @@ class EpisodeWriter:
                 self._first_s, self._last_s = min(self._first_s, row[time]), max(self._last_s, row[time])
                 if kind == "frame" and self.resolution is None:
                     image = cv2.imread(str(part / row["image_path"]))
-                    self.resolution = None if image is None else (image.shape[1], image.shape[0])
+                    if image is not None:
+                        self.resolution = image.shape[1], image.shape[0]
         damaged = f"; {self._left_out} damaged rows and pictures are left out" if self._left_out else ""
         self.metadata["fault"] = f"the recording was cut off{damaged}"
 
@@ -307,7 +311,6 @@ class EpisodeWriter:
             raise EpisodeError(f"{self.folder}: exists already", remedy=remedy, kind="exists")
 
     def _write(self, part: Path) -> None:
-        """Write the three files in the hidden folder."""
         if not self.controls or not self.frames:
             content = f"{self.controls} controls and {self.frames} frames"
             remedy = f"check that the camera and the Arduino deliver; {part.name} has what there is"
@@ -407,10 +410,9 @@ def _rows(part: Path, kind: str) -> Iterator[dict[str, Any] | None]:
     """Yield what was recorded of a kind, row by row; None for a damaged row."""
     with contextlib.suppress(FileNotFoundError), (part / f"{kind}.rows").open("rb") as file:
         for line in file:
-            try:
+            row = None
+            with contextlib.suppress(ValueError):
                 row = json.loads(line)
-            except ValueError:
-                row = None
             yield row if isinstance(row, dict) and KINDS[kind] in row else None
 
 

@@ -34,7 +34,7 @@ PAUSE_S = 5.0  # between two episodes
 _log = logging.getLogger("rover")
 
 
-class Recorder:
+class Recorder(contextlib.AbstractContextManager["Recorder"]):
     """Records an episode while a loop runs. The loop hands over controls, and a thread takes frames from the camera.
 
     folder: where the episode appears on close(), named episode_YYYYMMDD_HHMMSS by its start in local time (a second
@@ -73,9 +73,6 @@ class Recorder:
         except BaseException:
             self._writer.close()
             raise
-
-    def __enter__(self) -> "Recorder":
-        return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         begun = error is None or self.controls or self._queue  # else the car was not armed, say
@@ -126,7 +123,8 @@ class Recorder:
             _log.error("recording ended: %s", sentence)
 
     def _check_room(self) -> None:
-        folder, rows = self.folder.parent, ROW_BYTES * (self._writer.controls + self._writer.frames)
+        folder = self.folder.parent
+        rows = ROW_BYTES * (self._writer.controls + self._writer.frames)
         if self._most_bytes is not None and self._most_bytes - rows - self._writer.picture_bytes < LEAST_BYTES:
             problem = f"{folder}: no room is left of what episodes may take here"
             raise EpisodeError(problem, remedy="fetch them by `rover playbook drive`, or delete some")
@@ -154,7 +152,8 @@ class Recorder:
     def _collect(self) -> None:
         newest = self._camera.latest()
         number = newest.number if newest else 0  # that frame came before the episode began
-        last_s, captured_s = self._clock(), -1e9
+        last_s = self._clock()
+        captured_s = -1e9
         while True:
             frame = self._camera.wait(number, 0.1)
             closing = self._closing.is_set()  # read before the queue is emptied, so that nothing is lost

@@ -1,7 +1,5 @@
 """The view: a page in a browser that shows a drive and can stop it. It runs in its own process; no drive imports it.
 
-    asyncio.run(View(Address(), token).run(lambda url: print(url)))
-
 Drives connect to a Unix socket and send the messages that feed.py describes. Browsers get the page over HTTP, and each
 page opens a WebSocket. It receives the newest message, and the next one only after it has confirmed that it shows the
 previous one: so no messages queue up. A page may send only "shown N" and "stop", and the view never sends a drive
@@ -110,7 +108,8 @@ class View:
                 raise RoverError(f"no user {drive_user!r} is known here", remedy="provision the rover") from None
         self._open_to_all = drive_user is not None  # the socket; _accept() checks who connects
         car = car or this_car()
-        self._shape, self._pwm = CarShape.of(car), car.pwm
+        self._shape = CarShape.of(car)
+        self._pwm = car.pwm
         self._drives: list[socket.socket] = []  # the last one, the newest, is shown
         self._number = 0
         self._head: dict[str, Any] = {"phase": "no drive", "text": "no drive has come yet"}
@@ -168,7 +167,8 @@ class View:
         """Show this on the pages from now on. head: a message as in feed.py. picture: a JPEG, or empty for none."""
         self._number += 1
         pins = head.get("pins")
-        pins = pins if pins and None not in pins else None
+        if pins and None in pins:
+            pins = None
         plan = head.pop("plan", None)
         ribbon: list[tuple[float, float, float, float]] = []
         if plan and "size" in head:
@@ -198,8 +198,6 @@ class View:
                 drive.send(f"stop {who}".encode())
                 count += 1
         return count
-
-    # ---- drives
 
     def _listen(self, place: Path) -> socket.socket:
         if is_listened_at(place) or (place.exists() and not place.is_socket()):
@@ -251,8 +249,6 @@ class View:
                 text = "the drive has gone without a word; what the car does is not known"
                 gone = {"phase": GONE, "text": text, "tick": None, "pins": None, "who": ""}
                 self.show({**self._head, **gone}, self._picture)
-
-    # ---- browsers
 
     def _meet(self, runner: web.AppRunner) -> asyncio.Protocol:
         """Return a new connection's handler; without a token it has to leave soon, or as soon as many others come."""

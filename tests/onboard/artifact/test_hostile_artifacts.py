@@ -32,9 +32,6 @@ def hostile(artifacts, folder: Path, change=None, add=None) -> Path:
     return rewritten(artifacts["fp32"], folder / "hostile.pt", change or {}, add)
 
 
-# The archive
-
-
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 def test_no_other_record_is_accepted_and_none_twice(artifacts, tmp_path):
     for name in ("archive/../../harm", "/harm", "archive/code/__torch__/../x.py", "other/data.pkl"):
@@ -70,8 +67,6 @@ def test_a_bomb_is_known_by_its_header(artifacts, tmp_path, name):
     path.write_bytes(path.read_bytes().replace(struct.pack("<I", size), struct.pack("<I", 9000)))  # a header that lies
     refused(path, "is compressed" if "manifest" in name else "damaged")
 
-
-# What it says of itself
 
 CAMERA = {"name": "cam_front", "height": 72, "width": 128}
 MANIFESTS = [
@@ -116,9 +111,6 @@ def test_names_that_look_like_torchs_counter_are_kept_in_the_content_hash(artifa
         change = {".py": lambda raw, name=name: raw.replace(b"input", name, 1)}
         hashes.add(content_hash(rewritten(artifacts["static"], tmp_path / "other.pt", change)))
     assert len(hashes) == 4
-
-
-# What it runs
 
 
 def line_before_end(line: str):

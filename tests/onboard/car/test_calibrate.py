@@ -88,9 +88,6 @@ def test_what_is_no_car_says_what_was_seen(sticks, sentence):
         Desk(sticks).measure()
 
 
-# ---- the command
-
-
 @pytest.fixture
 def run(monkeypatch, tmp_path):
     """run(desk, *options) runs `rover calibrate` and returns its result and the path of car.yml."""

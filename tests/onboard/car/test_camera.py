@@ -98,9 +98,6 @@ def test_no_picture_of_a_real_drive_counts_as_frozen():
             assert camera.latest().repeats == 0
 
 
-# ---- what is no frame, on a virtual clock
-
-
 class Readings:
     """A camera that is read without a thread: the frames that it gives, and the error that ends it."""
 

@@ -9,7 +9,7 @@ import pytest
 
 from rover_lib.onboard.car import gamepad as gamepads
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.car.gamepad import ABS, BTN_L1, DROPPED, KEY, STEERING, SYN, THROTTLE, Found, Gamepad
+from rover_lib.onboard.car.gamepad import ABS, BTN_L1, DROPPED, KEY, STEERING, SYN, THROTTLE, Gamepad, GamepadDevice
 from rover_lib.onboard.car.servo_link import MISSING, ServoLink, frame, parse
 from rover_lib.onboard.errors import CarError
 
@@ -118,10 +118,10 @@ def test_one_that_is_unplugged_is_nobody_until_the_same_one_is_back(pad, monkeyp
     monkeypatch.setattr(gamepads, "list_gamepads", lambda: there)
     monkeypatch.setattr(gamepads.time, "sleep", None)  # nothing is waited for
     assert "none in /dev/input" in link.remedy("s")
-    there.append(Found("virtual", Path("B"), Path("B"), identity="B"))
+    there.append(GamepadDevice("virtual", Path("B"), Path("B"), identity="B"))
     assert "connect virtual again" in link.remedy("s") and link._gamepad is first
-    there.append(Found("virtual", Path("A"), Path("A"), identity="A"))
-    monkeypatch.setattr(Found, "open", lambda found: (pad.open(), pad.opened)[1])
+    there.append(GamepadDevice("virtual", Path("A"), Path("A"), identity="A"))
+    monkeypatch.setattr(GamepadDevice, "open", lambda found: (pad.open(), pad.opened)[1])
     assert link.remedy("s") == "hold L1 of the gamepad"
     assert ServoLink("none", car=Car()).remedy("s") == MISSING["s"]
     assert link._gamepad is pad.opened is not first and first.sticks() is None

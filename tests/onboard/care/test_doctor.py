@@ -31,9 +31,6 @@ def proc(tmp_path):
     return folder
 
 
-# ---- groups and cameras
-
-
 def test_what_this_user_may_use(tmp_path, monkeypatch):
     device = tmp_path / "video0"
     assert list(doctor.access("group video", device)) == []  # the camera's own check reports it
@@ -95,9 +92,6 @@ def test_the_real_frame_rate(tmp_path, monkeypatch, camera, verdict, found):
     with pytest.raises(CameraError):  # the policy has seen another shape than it gives
         list(doctor.camera_rate(source, (64, 48)))
     assert camera.size == (640, 480)
-
-
-# ---- the Arduino
 
 
 def talking(receiver):
@@ -174,9 +168,6 @@ def test_a_human_is_led_through_the_receiver(monkeypatch, wiggled, without_trans
     assert not [b for b in board.heard if b[1] in "AD"]  # nothing was armed, nothing driven
 
 
-# ---- the artifact
-
-
 @pytest.mark.slow
 def test_a_good_artifact_and_a_damaged_one(artifacts, tmp_path, proc):
     checks = list(doctor.policy(artifacts["static"]))
@@ -187,9 +178,6 @@ def test_a_good_artifact_and_a_damaged_one(artifacts, tmp_path, proc):
     checks = examine(broken, port=str(tmp_path / "none"), camera=str(tmp_path / "none"), host=Host(proc_root=proc))
     check = only(c for c in checks if c.name == "artifact")
     assert check.verdict == "fail" and check.found.startswith(f"{broken}: ")
-
-
-# ---- the machine
 
 
 def test_a_pi_that_is_well_and_one_that_is_not(pi_host, bare_host, proc, monkeypatch):
@@ -232,9 +220,6 @@ def test_a_policy_that_steers_mirrored_is_a_fail():
     mirrored = {"car": Car(positive="left").description()}
     assert [check.verdict for check in doctor.car(mirrored)] == ["ok", "fail"]
     assert [check.verdict for check in doctor.car({"car": Car().description()})] == ["ok"]
-
-
-# ---- all together
 
 
 def test_a_check_that_breaks_is_its_own_fail(tmp_path, monkeypatch):

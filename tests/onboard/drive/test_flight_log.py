@@ -51,9 +51,6 @@ def quick(monkeypatch):
     monkeypatch.setattr(module, "RETRY_S", 0.01)
 
 
-# ---- what is written
-
-
 def test_what_goes_in_comes_out(path, pi_host):
     unknown = tick(0, state="", reason="", plan=0, plan_age_ms=None, latency_ms=None, pins_steering_us=None)
     write(path, [unknown, tick(1, steering=np.float32(0.25), steering_us=np.int64(1500))], host=pi_host)
@@ -110,9 +107,6 @@ def test_limits_of_params_that_make_no_sense(tmp_path, monkeypatch, bad):
         module.log_limits()
 
 
-# ---- one file, many drives; a drive in many files
-
-
 @pytest.mark.parametrize("keep", [0, 2])
 def test_files_are_bounded_and_each_can_be_read_alone(path, keep):
     write(path, map(tick, range(1600)), max_bytes=20_000, keep=keep)
@@ -143,9 +137,6 @@ def test_drives_are_appended_and_chosen(path):
             log.event(module.ARMED)
             log.tick(tick(k))
     assert [read_log(path, k).ticks["frame"].tolist() for k in range(5)] == [[k] for k in range(5)]
-
-
-# ---- damage
 
 
 @pytest.fixture(scope="module")
@@ -199,9 +190,6 @@ def test_what_cannot_be_read(tmp_path):
     for name in ("nothing.log", ".", "empty.log"):
         with pytest.raises(RoverError):
             read_log(tmp_path / name)
-
-
-# ---- bad disks
 
 
 def test_a_full_disk_is_said_once_and_logging_goes_on_when_it_has_room(path, caplog, quick):
@@ -278,8 +266,6 @@ def test_a_stuck_disk_holds_up_neither_the_loop_nor_the_end(path, monkeypatch, q
         go_on.set()
         log._writer.join()
 
-
-# ---- the summary
 
 PLAN = ("latency_ms", "plan_age_ms")
 

@@ -107,12 +107,6 @@ def test_ends_as_asked(link, clock):
     assert "arm" not in link.said
 
 
-def test_whoever_may_end_it_is_asked_at_each_tick(link, clock):
-    asked = iter([None] * 4 + ["stopped from the view"])
-    report = go(Always(), link, clock, until=Until(over=lambda: next(asked)))
-    assert (report.ticks, report.ended, link.said[-1]) == (4, "stopped from the view", "neutral")
-
-
 @pytest.mark.parametrize(
     ("what", "raised"),
     [
@@ -182,9 +176,6 @@ def test_a_dry_run_drives_no_motor_and_tells_its_hooks(clock):
     assert [e for e in log.events if e in ("first", "third")] == ["first", "third"]
     (_, arduino_ms, *pulses), extra = rows[0]
     assert (arduino_ms, pulses, extra) == (0, [1456, 150, 21316, 1016], {"plan_age_ms": 100.0})
-
-
-# ---- the pilot of a policy
 
 
 class Eyes:
@@ -351,9 +342,6 @@ def test_no_picture_is_nothing_to_drive_by(pilot):
     pilot.eyes.frame = None
     with pytest.raises(CameraError):
         pilot.check()
-
-
-# ---- signals, and what surrounds the loop
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT])

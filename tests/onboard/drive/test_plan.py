@@ -77,12 +77,6 @@ def test_an_unfamiliar_place_fades_the_throttle_as_an_old_plan_does(unfamiliar, 
     assert (f.command(0.81) is None) == (unfamiliar == "stop")  # although it went back: a drive never forgets it
 
 
-def test_the_throttles_limit():
-    f = follower(throttle_limit=0.03)
-    f.add(Plan(1, 0.0, 0.0, ramp()), 0.0)
-    assert f.command(0.1).throttle == 0.03
-
-
 def test_an_older_frames_plan_is_left_aside():
     f = follower()
     f.add(Plan(1, 1.0, 1.1, ramp(0.5)), 1.1)

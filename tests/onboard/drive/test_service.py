@@ -30,7 +30,7 @@ from rover_lib.onboard.drive import service as s
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.drive.plan import Settings
-from rover_lib.onboard.drive.session import Arming, DriveOptions, Session, arm_when_ready, wanted_since
+from rover_lib.onboard.drive.session import Arming, DriveOptions, Session, arm_when_ready
 from rover_lib.onboard.errors import CameraError
 from tests.helpers.fake_drive import STATUS
 from tests.helpers.needs import until
@@ -174,14 +174,6 @@ def test_who_was_refused_may_ask_again(systemd):
     assert said == ["not armed: switch the transmitter on", "not armed: no transmitter"] and all(again)
     assert "switch the transmitter on" in answers[0][0] and "no transmitter" in answers[0][1]
     assert answers[0][2] == "driving: armed by a human"
-
-
-def test_nobody_can_ask_for_the_car_while_it_drives(systemd):
-    """Such a request would arm it again as soon as that drive ends."""
-    with served() as service:
-        with beside(systemd, ask_to_arm) as asked:
-            assert service.wait_for_human(armed) == "telemetry"
-        assert asked[0]["armed"] and s.ask_service(ask="state")["ticket"] == ""
 
 
 @pytest.mark.parametrize("old", [{"asked_s": s} for s in (-1e9, math.nan, math.inf, 101.0)] + [{"asked_s": 100.0}])
@@ -358,9 +350,6 @@ def test_another_user_arms_nothing_even_if_the_socket_is_open_to_all(systemd, mo
     assert "connect" not in done.stderr and "ab12" not in done.stdout, done  # it got no answer, or was cut off
 
 
-# rover arm-car
-
-
 def test_a_service_that_is_not_there_is_not_armed(tmp_path, monkeypatch):
     script = tmp_path / "systemctl"
     script.write_text("#!/bin/sh\nprintf 'LoadState=loaded\\nActiveState=inactive\\nStatusText=driving: x\\n'\n")
@@ -397,12 +386,9 @@ def test_ages_of_consent_go_on_while_the_machine_is_suspended(monkeypatch):
     monkeypatch.setattr(host.time, "clock_gettime", {time.CLOCK_BOOTTIME: 5000.0}.__getitem__)
     s.arm_car(s.Request())
     assert asked[-1]["asked_s"] == 5000.0
-    clocks = [(s.Service, "clock"), (wanted_since, "clock"), (Session, "now")]
-    assert [inspect.signature(what).parameters[name].default() for what, name in clocks] == [5000.0] * 3
+    clocks = [(s.Service, "clock"), (Session, "now")]
+    assert [inspect.signature(what).parameters[name].default() for what, name in clocks] == [5000.0] * 2
     assert DriveOptions(Path("policy.pt")).asked_s == 5000.0
-
-
-# Arming
 
 
 def session_of(asked_s=0.0, renew=lambda age_s: None, **parts):
@@ -461,14 +447,12 @@ def test_a_human_in_a_terminal_is_told_what_is_missing():
 
 
 @pytest.mark.parametrize("missing", ["ww-", "-"])
-def test_a_drive_that_waits_in_a_terminal_does_not_arm_later(missing):
+def test_a_drive_that_waits_in_a_terminal_does_not_arm_later(monkeypatch, missing):
     """It armed 3,628 s after the command, as the human let go of the throttle; or when a suspended machine woke up."""
-    wanted = wanted_since(0.0, iter([3600.0] if missing == "-" else [20.0, 31.0]).__next__)
+    times_s = [0.0, 3600.0] if missing == "-" else [0.0, 20.0, 31.0]
+    monkeypatch.setattr("rover_lib.onboard.drive.session.boottime", iter(times_s).__next__)
     with pytest.raises(s.RoverError, match="at most 30"):
-        arm_when_ready(lambda: pytest.fail("armed"), lacking(iter(missing)), threading.Event(), print, (), wanted)
-
-
-# The whole: rover drive --service, as systemd starts it
+        arm_when_ready(lambda: pytest.fail("armed"), lacking(iter(missing)), threading.Event(), print)
 
 
 def test_a_service_is_armed_by_a_human_and_a_loop_that_hangs_is_not_fed_for(systemd, tmp_path, demo_run):

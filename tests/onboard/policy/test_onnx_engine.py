@@ -7,19 +7,10 @@ import pytest
 
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.artifact.manifest import read_manifest
-from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.errors import ArtifactError
 from tests.helpers.archives import manifest_with, rewritten, vectors_with
 
 FRAME, STATE = np.full((360, 640, 3), 99, np.uint8), np.array([0.1, 0.2], np.float32)
-
-
-@pytest.mark.slow
-def test_runs_confined_in_a_process_of_its_own(onnx_static):
-    with PolicyProcess(onnx_static, threads=2) as process:
-        assert process.unconfined == ""
-        chunk = process.predict(FRAME, STATE)
-    assert np.array_equal(chunk, load_policy(onnx_static).predict_unclipped(FRAME, STATE))
 
 
 def test_refuses_what_is_not_proven(onnx_static, tmp_path):

@@ -58,9 +58,6 @@ def finish(folder):
     return rover("record", folder, "--finish")
 
 
-# ---- what is left
-
-
 def test_a_recording_that_was_cut_off_is_not_lost(tmp_path, caplog):
     """93 frames and 102 rows were, to every command."""
     part = cut(tmp_path / NAME)
@@ -210,9 +207,6 @@ def test_a_disk_that_cannot_sync_ends_the_recording(tmp_path, monkeypatch):
         with pytest.raises(EpisodeError, match="Input/output error"):
             fill(writer)
     assert len(content_of(writer.finish())["control_samples"]) == 1
-
-
-# ---- the format
 
 
 def test_format_of_a_real_recording_to_the_byte(tmp_path):

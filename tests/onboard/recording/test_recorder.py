@@ -81,9 +81,6 @@ def virtual():
     return Stepped()
 
 
-# ---- beside a loop
-
-
 def test_an_episode_beside_a_loop(tmp_path, virtual):
     before_s = time.time()
     about = About("driven", arduino_port="/dev/x", source="rover drive")
@@ -150,9 +147,6 @@ def test_a_car_that_was_not_armed_leaves_no_episode(tmp_path, virtual, caplog):
     assert names_in(tmp_path) == [] and (recorder.path, recorder.failure) == (None, None) and not caplog.records
 
 
-# ---- the disk
-
-
 def test_a_full_disk_is_seen_before_it_is_full(tmp_path, virtual, monkeypatch):
     def free(size):
         monkeypatch.setattr(os, "statvfs", lambda path: SimpleNamespace(f_bavail=size, f_frsize=1))
@@ -207,9 +201,6 @@ def test_a_disk_that_hangs_holds_up_nothing(tmp_path, virtual, monkeypatch):
     assert "has not taken" in recorder.failure and len(recorder._queue) <= 50
     hanging.set()
     recorder._thread.join(5)
-
-
-# ---- a human drives
 
 
 class FakeLink:
