@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from balloon_world.world import World
+from rover_lib.workshop.pictures.beside import find_swapped
 from rover_lib.workshop.pictures.shown import with_faults
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import Episode, Recordings
@@ -79,11 +80,26 @@ def grey(pictures):
         (lambda pictures: pictures, None),
     ],
 )
-@pytest.mark.parametrize("odd", [[1], [0, 4]])
+@pytest.mark.parametrize("odd", [[1], [1, 4]])
 def test_each_drive_that_shows_nothing_or_another_thing_is_named(change, kind, odd):
     found = recordings(change, odd)
     assert [(fault.file, fault.kind) for fault in found.faults] == [(f"e{d}", kind) for d in odd if kind]
     assert len(found.cautions()) == bool(kind) and found.faults_by_kind().keys() <= {"taken as recorded"}
+
+
+def test_drives_through_rooms_of_other_colours_are_rarely_called_swapped():
+    """In 10 of 60 draws of 3 to 8 worlds, which have floors and walls of their own; by likeness alone in 20."""
+    seen = []
+    for seed in range(30):
+        world, pictures = World(seed), []
+        for k in range(12):
+            pictures.append(cv2.resize(world.render(), (96, 72), interpolation=cv2.INTER_AREA))
+            for _ in range(5):
+                world.step(0.3 * np.sin(k + seed), 0.05)
+        seen.append(np.float32(pictures))
+    rng = np.random.default_rng(0)
+    draws = [rng.choice(len(seen), rng.integers(3, 9), replace=False) for _ in range(60)]
+    assert sum(find_swapped([seen[i] for i in draw]).any() for draw in draws) <= 10
 
 
 @pytest.mark.parametrize("times", [2, 3])
