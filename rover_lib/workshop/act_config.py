@@ -78,6 +78,68 @@ class ActConfig:
         return -(-height // stride), -(-width // stride)
 
 
+def weight_shapes(c: ActConfig) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the weights of LeRobot's ACT, without the seconds that importing it takes.
+
+    By name without the leading `model.`. Raises AssertionError for a width that the heads do not divide.
+    """
+    _, _, features = BACKBONES[c.backbone]
+    shapes = _backbone_shapes(c.backbone)
+    shapes |= {
+        "encoder_1d_feature_pos_embed.weight": (1 + c.sees_state, c.dim),
+        "decoder_pos_embed.weight": (c.chunk, c.dim),
+    }
+    linears = {
+        "encoder_latent_input_proj": (c.dim, c.latent),
+        "encoder_img_feat_input_proj": (c.dim, features, 1, 1),
+        "action_head": (len(c.action_names), c.dim),
+    }
+    layers = {"encoder": c.encoder_layers, "decoder": c.decoder_layers}
+    if c.vae_layers:
+        shapes |= {
+            "vae_encoder_cls_embed.weight": (1, c.dim),
+            "vae_encoder_pos_enc": (1, 1 + c.sees_state + c.chunk, c.dim),
+        }
+        linears["vae_encoder_action_input_proj"] = (c.dim, len(c.action_names))
+        linears["vae_encoder_latent_output_proj"] = (2 * c.latent, c.dim)
+        layers["vae_encoder"] = c.vae_layers
+    if c.sees_state:
+        for part in layers.keys() - {"decoder"}:
+            linears[f"{part}_robot_state_input_proj"] = (c.dim, len(c.state_names))
+    for name, shape in linears.items():
+        shapes |= {f"{name}.weight": shape, f"{name}.bias": shape[:1]}
+    for part, count in layers.items():
+        kind = nn.TransformerDecoderLayer if part == "decoder" else nn.TransformerEncoderLayer
+        layer = kind(c.dim, c.heads, c.feedforward, device="meta").state_dict()
+        for i in range(count):
+            shapes |= {f"{part}.layers.{i}.{name}": tuple(weight.shape) for name, weight in layer.items()}
+        if part == "decoder" or c.pre_norm:
+            shapes |= {f"{part}.norm.weight": (c.dim,), f"{part}.norm.bias": (c.dim,)}
+    return shapes
+
+
+def _backbone_shapes(backbone: str) -> dict[str, tuple[int, ...]]:
+    kernels = (3, 3) if BACKBONES[backbone][0] == "basic" else (1, 3, 1)
+    wider = 1 if len(kernels) == 2 else 4  # what leaves a block, in widths of its inner convolutions
+    convolutions = {("conv1", "bn1"): (64, 3, 7, 7)}
+    inputs = 64
+    for place in backbone_blocks(backbone):
+        block = place.removeprefix("backbone.")
+        width = 32 * 2 ** int(block[len("layer")])
+        channels = [inputs, *(width for _ in kernels[1:]), width * wider]
+        for i, kernel in enumerate(kernels):
+            shape = (channels[i + 1], channels[i], kernel, kernel)
+            convolutions[f"{block}.conv{i + 1}", f"{block}.bn{i + 1}"] = shape
+        if inputs != channels[-1]:
+            convolutions[f"{block}.downsample.0", f"{block}.downsample.1"] = (channels[-1], inputs, 1, 1)
+        inputs = channels[-1]
+    shapes: dict[str, tuple[int, ...]] = {}
+    for (convolution, norm), shape in convolutions.items():
+        shapes[f"backbone.{convolution}.weight"] = shape
+        shapes |= {f"backbone.{norm}.{name}": shape[:1] for name in ("weight", "bias", "running_mean", "running_var")}
+    return shapes
+
+
 def lerobot_act(c: ActConfig, weights: Mapping[str, Tensor] | None = None) -> "ACTPolicy":
     """Make LeRobot's own ACTPolicy of this shape, without normalisation. It downloads nothing.
 
