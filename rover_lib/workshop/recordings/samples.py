@@ -216,12 +216,19 @@ class Recordings:
         return {handled: dict(kinds.most_common()) for handled, kinds in counts.items() if kinds}
 
     def cautions(self) -> list[str]:
-        """A sentence for each kind of fault that makes a policy of these recordings drive badly."""
+        """A sentence for each kind of fault, and each action, that makes a policy of these recordings drive badly.
+
+        A throttle may be held.
+        """
         by_kind: dict[str, list[Fault]] = {}
         for fault in self.faults:
             if re.fullmatch(f"{SHOW_NOTHING}|other_state", fault.kind):
                 by_kind.setdefault(fault.kind, []).append(fault)
-        return [f"{f[0].file}{f' and {len(f) - 1} more' if f[1:] else ''}: {f[0].note}" for f in by_kind.values()]
+        sentences = [f"{f[0].file}{f' and {len(f) - 1} more' if f[1:] else ''}: {f[0].note}" for f in by_kind.values()]
+        for name, (low, high) in self.action_range().items():
+            if low == high and name != ACTION_NAMES[1]:
+                sentences.append(f"{name} is {low + 0.0:g} throughout: no policy can learn it here, or be judged on it")
+        return sentences
 
     def hashes(self) -> dict[str, str]:
         """SHA-256 of every file of the samples, by its path relative to `root`. Raises EpisodeError if one is gone."""

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from rover_lib.workshop.act import inputs_of
-from rover_lib.workshop.int8 import frames
+from rover_lib.workshop.int8 import frames, observe
 from rover_lib.workshop.int8.choose import Chooser
 from rover_lib.workshop.int8.observe import Calibration, _places, calibrate, restore_observed, times_of
 from rover_lib.workshop.int8.quantize import quantize
@@ -46,6 +46,15 @@ def test_a_range_reaches_from_usual_frames_to_all():
         ("backbone.layer4.1.relu", 0.5, (0, math.sqrt(1.2 * 60))),
     ):
         assert frames.range_over(EXTREMES[place], frames.usual(EXTREMES, 75), wider) == pytest.approx(expected)
+
+
+def test_only_the_named_places_reach_to_all_frames(monkeypatch):
+    observers = {place: SimpleNamespace() for place in EXTREMES}
+    monkeypatch.setattr(observe, "_places", lambda graph: observers)
+    scheme = Scheme(observer="frames", usual_pct=75, wider=(("image_project", 1.0),))
+    observe.set_ranges(None, scheme, SimpleNamespace(frames=EXTREMES))
+    assert observers["image_project"].of_frames == pytest.approx((-30, 3))
+    assert observers["backbone.layer4.1.relu"].of_frames == pytest.approx((0, 1.2))
 
 
 @pytest.mark.parametrize(("costs", "is_widened"), [(1.05, True), (1.15, False)])

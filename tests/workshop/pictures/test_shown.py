@@ -93,6 +93,17 @@ def test_each_drive_that_shows_nothing_or_another_thing_is_named(change, kind, o
     assert len(found.cautions()) == bool(kind) and found.faults_by_kind().keys() <= {"taken as recorded"}
 
 
+@pytest.mark.parametrize(("factors", "names"), [((0, 1), ["steering is 0 throughout"]), ((1, 0), [])])
+def test_steering_that_never_changes_is_named_and_a_held_throttle_is_not(factors, names):
+    whole = recordings(lambda pictures: pictures)
+    episodes = []
+    for episode in whole.episodes:
+        samples = tuple(replace(sample, chunk=sample.chunk * factors) for sample in episode.samples)
+        episodes.append(replace(episode, samples=samples))
+    cautions = replace(whole, episodes=tuple(episodes)).cautions()
+    assert [caution.partition(":")[0] for caution in cautions] == names
+
+
 @pytest.mark.parametrize("times", [2, 3])
 def test_pictures_that_stand_there_several_times_are_named_once(times):
     """As of a camera of 15 pictures a second in recordings of 30."""
