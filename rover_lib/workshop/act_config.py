@@ -78,66 +78,73 @@ class ActConfig:
         return -(-height // stride), -(-width // stride)
 
 
-def weight_shapes(c: ActConfig) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the weights of LeRobot's ACT, without the seconds that importing it takes.
+def check_shapes(c: ActConfig, weights: Mapping[str, Tensor]) -> None:
+    """Raise LeRobot's own error, RuntimeError mostly, unless its ACT of this config has just these weights.
 
-    By name without the leading `model.`. Raises AssertionError for a width that the heads do not divide.
+    It is imported where shapes differ, or where the backbone is dilated, as not each may be: that takes seconds.
     """
+    shapes = {name: tuple(weight.shape) for name, weight in weights.items()}
+    if c.dilation or shapes != weight_shapes(c):
+        lerobot_act(c, {}).model.load_state_dict(dict(weights), assign=True)
+
+
+def weight_shapes(c: ActConfig) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the weights of LeRobot's ACT, by name without the leading `model.`."""
     _, _, features = BACKBONES[c.backbone]
-    shapes = _backbone_shapes(c.backbone)
-    shapes |= {
-        "encoder_1d_feature_pos_embed.weight": (1 + c.sees_state, c.dim),
-        "decoder_pos_embed.weight": (c.chunk, c.dim),
-    }
-    linears = {
-        "encoder_latent_input_proj": (c.dim, c.latent),
-        "encoder_img_feat_input_proj": (c.dim, features, 1, 1),
-        "action_head": (len(c.action_names), c.dim),
-    }
-    layers = {"encoder": c.encoder_layers, "decoder": c.decoder_layers}
-    if c.vae_layers:
-        shapes |= {
-            "vae_encoder_cls_embed.weight": (1, c.dim),
-            "vae_encoder_pos_enc": (1, 1 + c.sees_state + c.chunk, c.dim),
+    with torch.device("meta"):
+        parts = _backbone_parts(c.backbone) | {
+            "encoder": _encoder(c, c.encoder_layers),
+            "decoder": nn.TransformerDecoder(
+                nn.TransformerDecoderLayer(c.dim, c.heads, c.feedforward), c.decoder_layers, nn.LayerNorm(c.dim)
+            ),
+            "encoder_latent_input_proj": nn.Linear(c.latent, c.dim),
+            "encoder_img_feat_input_proj": nn.Conv2d(features, c.dim, 1),
+            "encoder_1d_feature_pos_embed": nn.Embedding(1 + c.sees_state, c.dim),
+            "decoder_pos_embed": nn.Embedding(c.chunk, c.dim),
+            "action_head": nn.Linear(c.dim, len(c.action_names)),
         }
-        linears["vae_encoder_action_input_proj"] = (c.dim, len(c.action_names))
-        linears["vae_encoder_latent_output_proj"] = (2 * c.latent, c.dim)
-        layers["vae_encoder"] = c.vae_layers
-    if c.sees_state:
-        for part in layers.keys() - {"decoder"}:
-            linears[f"{part}_robot_state_input_proj"] = (c.dim, len(c.state_names))
-    for name, shape in linears.items():
-        shapes |= {f"{name}.weight": shape, f"{name}.bias": shape[:1]}
-    for part, count in layers.items():
-        kind = nn.TransformerDecoderLayer if part == "decoder" else nn.TransformerEncoderLayer
-        layer = kind(c.dim, c.heads, c.feedforward, device="meta").state_dict()
-        for i in range(count):
-            shapes |= {f"{part}.layers.{i}.{name}": tuple(weight.shape) for name, weight in layer.items()}
-        if part == "decoder" or c.pre_norm:
-            shapes |= {f"{part}.norm.weight": (c.dim,), f"{part}.norm.bias": (c.dim,)}
-    return shapes
-
-
-def _backbone_shapes(backbone: str) -> dict[str, tuple[int, ...]]:
-    kernels = (3, 3) if BACKBONES[backbone][0] == "basic" else (1, 3, 1)
-    wider = 1 if len(kernels) == 2 else 4  # what leaves a block, in widths of its inner convolutions
-    convolutions = {("conv1", "bn1"): (64, 3, 7, 7)}
-    inputs = 64
-    for place in backbone_blocks(backbone):
-        block = place.removeprefix("backbone.")
-        width = 32 * 2 ** int(block[len("layer")])
-        channels = [inputs, *(width for _ in kernels[1:]), width * wider]
-        for i, kernel in enumerate(kernels):
-            shape = (channels[i + 1], channels[i], kernel, kernel)
-            convolutions[f"{block}.conv{i + 1}", f"{block}.bn{i + 1}"] = shape
-        if inputs != channels[-1]:
-            convolutions[f"{block}.downsample.0", f"{block}.downsample.1"] = (channels[-1], inputs, 1, 1)
-        inputs = channels[-1]
+        if c.vae_layers:
+            parts |= {
+                "vae_encoder": _encoder(c, c.vae_layers),
+                "vae_encoder_cls_embed": nn.Embedding(1, c.dim),
+                "vae_encoder_action_input_proj": nn.Linear(len(c.action_names), c.dim),
+                "vae_encoder_latent_output_proj": nn.Linear(c.dim, 2 * c.latent),
+            }
+        if c.sees_state:
+            for encoder in {"encoder", "vae_encoder"} & parts.keys():
+                parts[f"{encoder}_robot_state_input_proj"] = nn.Linear(len(c.state_names), c.dim)
     shapes: dict[str, tuple[int, ...]] = {}
-    for (convolution, norm), shape in convolutions.items():
-        shapes[f"backbone.{convolution}.weight"] = shape
-        shapes |= {f"backbone.{norm}.{name}": shape[:1] for name in ("weight", "bias", "running_mean", "running_var")}
-    return shapes
+    for part, module in parts.items():
+        shapes |= {f"{part}.{name}": tuple(weight.shape) for name, weight in module.state_dict().items()}
+    if c.vae_layers:
+        shapes["vae_encoder_pos_enc"] = (1, 1 + c.sees_state + c.chunk, c.dim)
+    # LeRobot's batch norms are frozen ones
+    return {name: shape for name, shape in shapes.items() if not name.endswith("num_batches_tracked")}
+
+
+def _encoder(c: ActConfig, layers: int) -> nn.Module:
+    layer = nn.TransformerEncoderLayer(c.dim, c.heads, c.feedforward)
+    return nn.TransformerEncoder(layer, layers, nn.LayerNorm(c.dim) if c.pre_norm else None, enable_nested_tensor=False)
+
+
+def _backbone_parts(backbone: str) -> dict[str, nn.Module]:
+    kernels = (3, 3) if BACKBONES[backbone][0] == "basic" else (1, 3, 1)
+    parts: dict[str, nn.Module] = {
+        "backbone.conv1": nn.Conv2d(3, 64, 7, bias=False),
+        "backbone.bn1": nn.BatchNorm2d(64),
+    }
+    inputs = 64
+    for block in backbone_blocks(backbone):
+        width = 32 * 2 ** int(block[len("backbone.layer")])
+        channels = [inputs, *(width for _ in kernels[1:]), width if len(kernels) == 2 else 4 * width]
+        for i, kernel in enumerate(kernels):
+            parts[f"{block}.conv{i + 1}"] = nn.Conv2d(channels[i], channels[i + 1], kernel, bias=False)
+            parts[f"{block}.bn{i + 1}"] = nn.BatchNorm2d(channels[i + 1])
+        if inputs != channels[-1]:
+            parts[f"{block}.downsample.0"] = nn.Conv2d(inputs, channels[-1], 1, bias=False)
+            parts[f"{block}.downsample.1"] = nn.BatchNorm2d(channels[-1])
+        inputs = channels[-1]
+    return parts
 
 
 def lerobot_act(c: ActConfig, weights: Mapping[str, Tensor] | None = None) -> "ACTPolicy":

@@ -19,15 +19,7 @@ from rover_lib.onboard.checked import broken_rule, is_whole
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.act import ACT, inputs_of, predictions
-from rover_lib.workshop.act_config import (
-    ACTIVATIONS,
-    BACKBONES,
-    ActConfig,
-    Affine,
-    imagenet,
-    lerobot_act,
-    weight_shapes,
-)
+from rover_lib.workshop.act_config import ACTIVATIONS, BACKBONES, ActConfig, Affine, check_shapes, imagenet
 from rover_lib.workshop.checkpoint.facts import GUESS, USER, Facts
 from rover_lib.workshop.checkpoint.files import CORRECT_IT, RATE_HZ, as_checkpoint_error, save_torch
 from rover_lib.workshop.checkpoint.lerobot import SIZE_OF_BASE, lerobot_folder, read_lerobot, write_lerobot
@@ -352,9 +344,7 @@ def check_weights(path: Path, c: ActConfig, weights: dict[str, Tensor], unknown:
     keys = quote_all(unknown)
     forked = f"; nobody here knows {keys}: train with LeRobot's own ACT if that asks for other weights" if keys else ""
     with as_checkpoint_error(path, CORRECT_IT + forked):
-        shapes = {name: tuple(weight.shape) for name, weight in weights.items()}
-        if c.dilation or shapes != weight_shapes(c):  # LeRobot says what differs, and which backbones may be dilated
-            lerobot_act(c, {}).model.load_state_dict(weights, assign=True)
+        check_shapes(c, weights)
     if bad := [k for k, v in weights.items() if not torch.isfinite(v.float()).all()]:
         problem = f"{path}: NaN or Inf in {quote_all(bad)}"
         raise CheckpointError(problem, remedy="training diverged, take an earlier checkpoint")

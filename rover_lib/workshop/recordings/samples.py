@@ -216,10 +216,7 @@ class Recordings:
         return {handled: dict(kinds.most_common()) for handled, kinds in counts.items() if kinds}
 
     def cautions(self) -> list[str]:
-        """A sentence for each kind of fault, and each action, that makes a policy of these recordings drive badly.
-
-        A throttle may be held.
-        """
+        """A sentence for each kind of fault, or action but a held throttle, that makes a policy drive badly."""
         by_kind: dict[str, list[Fault]] = {}
         for fault in self.faults:
             if re.fullmatch(f"{SHOW_NOTHING}|other_state", fault.kind):

@@ -76,6 +76,7 @@ def grey(pictures):
     [
         (frozen, "frozen_camera"),
         (blank(0), "blank_pictures"),
+        (blank(0, 1), "blank_pictures"),
         (blank(128), "blank_pictures"),
         (blank((0, 130, 0)), "blank_pictures"),
         (blank(250, 5), "blank_pictures"),
@@ -93,15 +94,13 @@ def test_each_drive_that_shows_nothing_or_another_thing_is_named(change, kind, o
     assert len(found.cautions()) == bool(kind) and found.faults_by_kind().keys() <= {"taken as recorded"}
 
 
-@pytest.mark.parametrize(("factors", "names"), [((0, 1), ["steering is 0 throughout"]), ((1, 0), [])])
-def test_steering_that_never_changes_is_named_and_a_held_throttle_is_not(factors, names):
-    whole = recordings(lambda pictures: pictures)
-    episodes = []
-    for episode in whole.episodes:
-        samples = tuple(replace(sample, chunk=sample.chunk * factors) for sample in episode.samples)
-        episodes.append(replace(episode, samples=samples))
-    cautions = replace(whole, episodes=tuple(episodes)).cautions()
-    assert [caution.partition(":")[0] for caution in cautions] == names
+@pytest.mark.parametrize(("factors", "named"), [((0, 1), True), ((1, 0), False)])
+def test_steering_that_never_changes_is_named_and_a_held_throttle_is_not(factors, named):
+    found = recordings(lambda pictures: pictures)
+    (first, *_) = found.episodes
+    still = replace(first, samples=tuple(replace(sample, chunk=sample.chunk * factors) for sample in first.samples))
+    cautions = replace(found, episodes=(still,)).cautions()
+    assert any("steering is 0 throughout" in caution for caution in cautions) == named
 
 
 @pytest.mark.parametrize("times", [2, 3])
