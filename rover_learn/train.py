@@ -34,7 +34,7 @@ from rover_lib.workshop import act as act_module
 from rover_lib.workshop import act_config
 from rover_lib.workshop.act import ActConfig
 from rover_lib.workshop.cache import cache_folder, cache_root, key_of
-from rover_lib.workshop.checkpoint.files import save_torch
+from rover_lib.workshop.checkpoint.files import RATE_HZ, save_torch
 from rover_lib.workshop.checkpoint.lerobot import write_lerobot
 from rover_lib.workshop.checkpoint.trainer import trainer_config
 from rover_lib.workshop.pictures.shown import with_faults
@@ -51,7 +51,6 @@ from rover_lib.workshop.recordings.source import Source
 if TYPE_CHECKING:
     pass
 
-PLANNED_HZ = 30.0  # of the user's trainer
 SIZES = {
     "small": ActConfig(
         image_sizes=((72, 128),), dim=128, heads=4, feedforward=512, encoder_layers=1, decoder_layers=1, vae_layers=1
@@ -164,9 +163,9 @@ def _rate_hz(recordings: Recordings) -> float:
         what = f"{recordings.root}: rover train is for cars of steering and throttle with one camera"
         remedy = f"name them, as in --action-names steering,throttle, or: {lerobot_train(recordings.root)}"
         raise EpisodeError(what, found=layout.words(), remedy=remedy)
-    found_hz = layout.rate_hz or usual_rate_hz(recordings.episodes) or PLANNED_HZ
-    as_recorded = layout.rate_hz or recorded.is_another_rate(found_hz, PLANNED_HZ)
-    return float(recorded.round_rate_hz(found_hz)) if as_recorded else PLANNED_HZ
+    found_hz = layout.rate_hz or usual_rate_hz(recordings.episodes) or RATE_HZ
+    as_recorded = layout.rate_hz or recorded.is_another_rate(found_hz, RATE_HZ)
+    return float(recorded.round_rate_hz(found_hz)) if as_recorded else RATE_HZ
 
 
 def _turned(recordings: Recordings, progress: Progress) -> Recordings:

@@ -51,7 +51,7 @@ def refused(path) -> str:
 def test_reads_the_trainers_file(tiny, tiny_file, tiny_policy, tmp_path):
     c, r = tiny.config, tiny.report
     assert (c.chunk, c.dim, c.heads, c.feedforward, c.latent, c.vae_layers) == (32, 64, 4, 128, 32, 1)
-    assert c.image_sizes == ((72, 128),) and c.action_names == ("steering", "throttle")
+    assert c.image_sizes == ((72, 128),) and c.action_names == ("steering", "throttle") and c.rate_hz == 30
     assert r["parameters"] == sum(p.numel() for p in tiny_policy.state_dict().values())
     assert r["parameters"] - r["parameters_acting"] > 0
     assert r["best_val_loss"] == pytest.approx(0.15) and r["epoch"] == 7 and json.dumps(r)
