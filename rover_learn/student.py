@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.workshop.act import ACT, FeedForward, multiply_accumulates
-from rover_lib.workshop.act_config import BACKBONES, ActConfig, lerobot_act
+from rover_lib.workshop.act_config import BACKBONES, ActConfig, weight_shapes
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.hooks import watched
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
@@ -85,7 +85,7 @@ def refuse_no_car(policy: Checkpoint) -> None:
 
 def gmac(config: ActConfig, weights: dict[str, Tensor] | None = None) -> float:
     """Return the multiply-accumulates of one inference, in 10^9. weights: None means a policy without dead channels."""
-    weights = weights or {k: torch.ones(w.shape) for k, w in lerobot_act(config, {}).model.state_dict().items()}
+    weights = weights or {name: torch.ones(shape) for name, shape in weight_shapes(config).items()}
     return sum(multiply_accumulates(ACT(config, weights)).values()) / 1e9
 
 

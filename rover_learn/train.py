@@ -28,7 +28,7 @@ from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop import act, act_config
 from rover_lib.workshop.act import ActConfig
 from rover_lib.workshop.cache import cache_folder, cache_root, key_of
-from rover_lib.workshop.checkpoint.files import save_torch
+from rover_lib.workshop.checkpoint.files import RATE_HZ, save_torch
 from rover_lib.workshop.checkpoint.lerobot import write_lerobot
 from rover_lib.workshop.checkpoint.trainer import trainer_config
 from rover_lib.workshop.pictures.shown import with_faults
@@ -41,7 +41,6 @@ from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings
 from rover_lib.workshop.recordings.source import Source
 
-PLANNED_HZ = 30.0  # of the user's trainer
 SIZES = {
     "small": ActConfig(
         image_sizes=((72, 128),), dim=128, heads=4, feedforward=512, encoder_layers=1, decoder_layers=1, vae_layers=1
@@ -160,10 +159,10 @@ def _rate_hz(recordings: Recordings) -> float:
         problem = f"{recordings.root}: rover train is for cars of steering and throttle with one camera"
         remedy = f"name them, as in --action-names steering,throttle, or: {lerobot_train(recordings.root)}"
         raise EpisodeError(problem, found=layout.words(), remedy=remedy)
-    rate_hz = layout.rate_hz or usual_rate_hz(recordings.episodes) or PLANNED_HZ
-    if layout.rate_hz or samples.is_another_rate(rate_hz, PLANNED_HZ):
+    rate_hz = layout.rate_hz or usual_rate_hz(recordings.episodes) or RATE_HZ
+    if layout.rate_hz or samples.is_another_rate(rate_hz, RATE_HZ):
         return float(samples.round_rate_hz(rate_hz))
-    return PLANNED_HZ
+    return RATE_HZ
 
 
 def _turned(recordings: Recordings, progress: Progress) -> Recordings:

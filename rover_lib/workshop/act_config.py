@@ -81,6 +81,75 @@ class ActConfig:
         return -(-height // stride), -(-width // stride)
 
 
+def check_shapes(c: ActConfig, weights: Mapping[str, Tensor]) -> None:
+    """Raise LeRobot's own error, RuntimeError mostly, unless its ACT of this config has just these weights.
+
+    It is imported where shapes differ, or where the backbone is dilated, as not each may be: that takes seconds.
+    """
+    shapes = {name: tuple(weight.shape) for name, weight in weights.items()}
+    if c.dilation or shapes != weight_shapes(c):
+        lerobot_act(c, {}).model.load_state_dict(dict(weights), assign=True)
+
+
+def weight_shapes(c: ActConfig) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the weights of LeRobot's ACT, by name without the leading `model.`."""
+    _, _, features = BACKBONES[c.backbone]
+    with torch.device("meta"):
+        parts = _backbone_parts(c.backbone) | {
+            "encoder": _encoder(c, c.encoder_layers),
+            "decoder": nn.TransformerDecoder(
+                nn.TransformerDecoderLayer(c.dim, c.heads, c.feedforward), c.decoder_layers, nn.LayerNorm(c.dim)
+            ),
+            "encoder_latent_input_proj": nn.Linear(c.latent, c.dim),
+            "encoder_img_feat_input_proj": nn.Conv2d(features, c.dim, 1),
+            "encoder_1d_feature_pos_embed": nn.Embedding(1 + c.sees_state, c.dim),
+            "decoder_pos_embed": nn.Embedding(c.chunk, c.dim),
+            "action_head": nn.Linear(c.dim, len(c.action_names)),
+        }
+        if c.vae_layers:
+            parts |= {
+                "vae_encoder": _encoder(c, c.vae_layers),
+                "vae_encoder_cls_embed": nn.Embedding(1, c.dim),
+                "vae_encoder_action_input_proj": nn.Linear(len(c.action_names), c.dim),
+                "vae_encoder_latent_output_proj": nn.Linear(c.dim, 2 * c.latent),
+            }
+        if c.sees_state:
+            for encoder in {"encoder", "vae_encoder"} & parts.keys():
+                parts[f"{encoder}_robot_state_input_proj"] = nn.Linear(len(c.state_names), c.dim)
+    shapes: dict[str, tuple[int, ...]] = {}
+    for part, module in parts.items():
+        shapes |= {f"{part}.{name}": tuple(weight.shape) for name, weight in module.state_dict().items()}
+    if c.vae_layers:
+        shapes["vae_encoder_pos_enc"] = (1, 1 + c.sees_state + c.chunk, c.dim)
+    # LeRobot's batch norms are frozen ones
+    return {name: shape for name, shape in shapes.items() if not name.endswith("num_batches_tracked")}
+
+
+def _encoder(c: ActConfig, layers: int) -> nn.Module:
+    layer = nn.TransformerEncoderLayer(c.dim, c.heads, c.feedforward)
+    return nn.TransformerEncoder(layer, layers, nn.LayerNorm(c.dim) if c.pre_norm else None, enable_nested_tensor=False)
+
+
+def _backbone_parts(backbone: str) -> dict[str, nn.Module]:
+    kernels = (3, 3) if BACKBONES[backbone][0] == "basic" else (1, 3, 1)
+    parts: dict[str, nn.Module] = {
+        "backbone.conv1": nn.Conv2d(3, 64, 7, bias=False),
+        "backbone.bn1": nn.BatchNorm2d(64),
+    }
+    inputs = 64
+    for block in backbone_blocks(backbone):
+        width = 32 * 2 ** int(block[len("backbone.layer")])
+        channels = [inputs, *(width for _ in kernels[1:]), width if len(kernels) == 2 else 4 * width]
+        for i, kernel in enumerate(kernels):
+            parts[f"{block}.conv{i + 1}"] = nn.Conv2d(channels[i], channels[i + 1], kernel, bias=False)
+            parts[f"{block}.bn{i + 1}"] = nn.BatchNorm2d(channels[i + 1])
+        if inputs != channels[-1]:
+            parts[f"{block}.downsample.0"] = nn.Conv2d(inputs, channels[-1], 1, bias=False)
+            parts[f"{block}.downsample.1"] = nn.BatchNorm2d(channels[-1])
+        inputs = channels[-1]
+    return parts
+
+
 def lerobot_act(c: ActConfig, weights: Mapping[str, Tensor] | None = None) -> "ACTPolicy":
     """Make LeRobot's own ACTPolicy of this shape, without normalisation. It downloads nothing.
 

@@ -205,12 +205,14 @@ def test_a_dataset_of_another_car_is_read_as_its_own(tmp_path, monkeypatch):
 
 
 def test_a_part_ends_at_a_gap_and_where_a_plan_does():
-    def sample(row, ends=False):
-        return SimpleNamespace(row=row, is_pad=[False, ends], driver="human", frame_bgr=lambda: PICTURE)
+    def sample(row, ends=False, driver="human"):
+        return SimpleNamespace(row=row, is_pad=[False, ends], driver=driver, frame_bgr=lambda: PICTURE)
 
-    rows = [sample(0), sample(1), sample(2), sample(5), sample(6, ends=True), sample(7)]
-    parts = _parts(SimpleNamespace(samples=rows), None, PICTURE.shape, Counter())
-    assert [[sample.row for sample, _ in part] for part in parts] == [[0, 1, 2], [5, 6], [7]]
+    rows = [sample(0), sample(1), sample(2), sample(5), sample(6, ends=True), sample(7), sample(8, driver="nobody")]
+    left_out = Counter()
+    parts = _parts(SimpleNamespace(samples=[*rows, sample(9)]), None, PICTURE.shape, left_out)
+    assert [[sample.row for sample, _ in part] for part in parts] == [[0, 1, 2], [5, 6], [7], [9]]
+    assert left_out == {"nobody_drove": 1}
 
 
 PICTURE = np.zeros((18, 32, 3), np.uint8)

@@ -8,7 +8,7 @@ import torch
 from rover_learn.student import StudentShape, initial_weights, student_config
 from rover_lib.onboard.errors import CheckpointError, TrainingError
 from rover_lib.workshop.act import ACT, inputs_of, predictions
-from rover_lib.workshop.act_config import lerobot_act
+from rover_lib.workshop.act_config import weight_shapes
 from tests.helpers.policies import memory_samples
 
 
@@ -17,15 +17,11 @@ def inputs(tiny):
     return [inputs_of(s, tiny.config) for s in memory_samples(6)]
 
 
-def shapes(weights):
-    return {name: tuple(weight.shape) for name, weight in weights.items()}
-
-
 def test_at_another_size_it_is_the_teacher(tiny):
     config = student_config(tiny, StudentShape(54, 96))
     weights = initial_weights(tiny, config, [])
     assert (config.image_sizes, config.vae_layers) == (((54, 96),), 0)
-    assert shapes(weights) == shapes(lerobot_act(config, {}).model.state_dict())
+    assert {name: tuple(weight.shape) for name, weight in weights.items()} == weight_shapes(config)
     smaller = tiny.at_size(54, 96)
     observations = [inputs_of(s, config) for s in memory_samples(2)]
     expected = predictions(ACT(smaller.config, smaller.weights), observations)

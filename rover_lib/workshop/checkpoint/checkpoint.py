@@ -19,7 +19,7 @@ from rover_lib.onboard.checked import broken_rule, is_whole
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.act import ACT, inputs_of, predictions
-from rover_lib.workshop.act_config import ACTIVATIONS, BACKBONES, ActConfig, Affine, imagenet, lerobot_act
+from rover_lib.workshop.act_config import ACTIVATIONS, BACKBONES, ActConfig, Affine, check_shapes, imagenet
 from rover_lib.workshop.checkpoint.facts import GUESS, USER, Facts
 from rover_lib.workshop.checkpoint.files import CORRECT_IT, RATE_HZ, as_checkpoint_error, save_torch
 from rover_lib.workshop.checkpoint.lerobot import SIZE_OF_BASE, lerobot_folder, read_lerobot, write_lerobot
@@ -246,12 +246,11 @@ def planned_error(policy: Checkpoint, samples: Sequence[Sample], action: int | N
     return float((errors if action is None else errors[:, action]).mean())
 
 
-def load_checkpoint(path: Path | str, checked: str | None = None, said: str = "") -> Checkpoint:
+def load_checkpoint(path: Path | str, said: str = "") -> Checkpoint:
     """Read and check a checkpoint.
 
     path: a trainer's .pth file; a LeRobot folder with config.json and model.safetensors; the output folder of
     `lerobot-train`, of which the last checkpoint is read, or one of its checkpoints.
-    checked: the sha256 of weights that an earlier call has held against their config, for which LeRobot takes seconds.
     said: what the user says of it by --facts.
 
     Raises CheckpointError, in one sentence, for a file that is missing or damaged, that would have to run code, or
@@ -271,8 +270,7 @@ def load_checkpoint(path: Path | str, checked: str | None = None, said: str = ""
     facts = Facts(path, said)
     config, weights, extra = read_lerobot(path, facts) if kind == "lerobot" else read_trainer(path, facts)
     check_limits(path, config)
-    if (sha256 := sha256_of(file)) != checked:
-        check_weights(path, config, weights, facts.unknown)
+    check_weights(path, config, weights, facts.unknown)
     if facts.unknown:
         facts.notes.append(f"nobody here knows what these keys mean, not used: {quote_all(facts.unknown)}")
     acts = sum(weight.numel() for name, weight in weights.items() if not name.startswith("vae_"))
@@ -286,7 +284,7 @@ def load_checkpoint(path: Path | str, checked: str | None = None, said: str = ""
         **_words(config, facts),
         **extra,
     }
-    return Checkpoint(path, kind, config, weights, sha256, report, facts)
+    return Checkpoint(path, kind, config, weights, sha256_of(file), report, facts)
 
 
 def normalisation(c: ActConfig) -> dict[str, str]:
@@ -351,7 +349,7 @@ def check_weights(path: Path, c: ActConfig, weights: dict[str, Tensor], unknown:
     keys = quote_all(unknown)
     forked = f"; nobody here knows {keys}: train with LeRobot's own ACT if that asks for other weights" if keys else ""
     with as_checkpoint_error(path, CORRECT_IT + forked):
-        lerobot_act(c, {}).model.load_state_dict(weights, assign=True)
+        check_shapes(c, weights)
     if bad := [k for k, v in weights.items() if not torch.isfinite(v.float()).all()]:
         problem = f"{path}: NaN or Inf in {quote_all(bad)}"
         raise CheckpointError(problem, remedy="training diverged, take an earlier checkpoint")

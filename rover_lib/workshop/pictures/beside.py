@@ -15,7 +15,7 @@ SATURATED = 60.0  # grey levels from grey; a white balance makes less of grey
 COLOURED = 0.01  # how far, in shares of the picture, the hues of a drive must be from their swapped ones
 MOST_OF = 0.9  # the share of the drives that must be alike, once they are turned
 UNLIKE = 0.3  # how much nearer the right description must be, by cosine
-# Of a drive whose colours are swapped, its cosine to the others' mean once it is turned, and how much less it is before.
+# Of a drive whose colours are swapped: its cosine to the others' mean once it is turned, and how much less it was.
 # By UNLIKE alone, one of eight draws of 3 to 20 of the demo's drives had a drive too many: floors and walls differ.
 TURNED_LEAST, TURNED_NEARER = 0.5, 0.4
 

@@ -10,7 +10,7 @@ evenly chosen, each beside the next one; so 14,000 take seconds.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import cv2
@@ -55,6 +55,12 @@ class _Drive:
     def frozen(self) -> bool:
         return self.longest >= FROZEN
 
+    @cached_property
+    def flat(self) -> np.ndarray:
+        """Whether each picture is of one colour, (n,) bool."""
+        blocks = self.pictures.reshape(len(self.pictures), 8, SEEN[1] // 8, 12, SEEN[0] // 12, 3).mean((2, 4))
+        return np.ptp(blocks, axis=(1, 2)).max(1) < FLAT
+
 
 def with_faults(recordings: Recordings, progress: Progress = silent) -> Recordings:
     """Return the recordings with a fault for each drive whose pictures do not show what the car saw."""
@@ -69,7 +75,7 @@ def with_faults(recordings: Recordings, progress: Progress = silent) -> Recordin
                 drives.append(drive)
                 _note_nothing(drive, of_camera, faults)
         _note_repeated(drives, of_camera, faults)
-        _note_others(drives, of_camera, faults)
+        _note_others([drive for drive in drives if drive.flat.mean() < BLANK], of_camera, faults)
     return replace(
         recordings, faults=tuple(sorted((*recordings.faults, *faults.listed()), key=lambda f: (f.file, f.kind)))
     )
@@ -123,8 +129,7 @@ def _note_nothing(drive: _Drive, of_camera: str, faults: Faults) -> None:
     """Add a fault for a camera that stood still, and for pictures of a single colour."""
     frames = drive.episode.frames
     means = drive.pictures.mean((1, 2, 3))
-    blocks = drive.pictures.reshape(len(drive.pictures), 8, SEEN[1] // 8, 12, SEEN[0] // 12, 3).mean((2, 4))
-    flat = np.ptp(blocks, axis=(1, 2)).max(1) < FLAT
+    flat = drive.flat
     if flat.mean() >= BLANK:
         mean = float(means[flat].mean())
         word = "of one colour"

@@ -221,7 +221,7 @@ class Recordings:
         return {handled: dict(kinds.most_common()) for handled, kinds in counts.items() if kinds}
 
     def cautions(self) -> list[str]:
-        """A sentence for each kind of fault that makes a policy of these recordings drive badly."""
+        """A sentence for each kind of fault, or action but a held throttle, that makes a policy drive badly."""
         by_kind: dict[str, list[Fault]] = {}
         for fault in self.faults:
             if re.fullmatch(f"{SHOW_NOTHING}|other_state", fault.kind):
@@ -230,6 +230,9 @@ class Recordings:
         for first, *others in by_kind.values():
             more = f" and {len(others)} more" if others else ""
             sentences.append(f"{first.file}{more}: {first.note}")
+        for name, (low, high) in self.action_range().items():
+            if low == high and name != ACTION_NAMES[1]:
+                sentences.append(f"{name} is {low + 0.0:g} throughout: no policy can learn it here, or be judged on it")
         return sentences
 
     def hashes(self) -> dict[str, str]:

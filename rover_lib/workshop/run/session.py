@@ -31,18 +31,16 @@ class Opened:
     parts: Split
 
 
-def load(
-    checkpoint: Path | str, episodes: Path | str | Source, progress: Progress = silent, checked: str | None = None
-) -> Opened:
+def load(checkpoint: Path | str, episodes: Path | str | Source, progress: Progress = silent) -> Opened:
     """Read a checkpoint and its recordings, and split the recordings as params.yml says.
 
     A LeRobot policy gets its own cameras of a LeRobotDataset unless the user chose others, and the dataset's order and
-    rate of numbers; one that was trained on the actions of older firmware gets today's units. checked: as
-    of `load_checkpoint`. Raises CheckpointError and EpisodeError.
+    rate of numbers; one that was trained on the actions of older firmware gets today's units.
+    Raises CheckpointError and EpisodeError.
     """
     p = params()["calibration"]
     source = Source.of(episodes)
-    policy = load_checkpoint(checkpoint, checked, source.facts)
+    policy = load_checkpoint(checkpoint, source.facts)
     theirs = policy.config.cameras
     if policy.format == "lerobot" and source.cameras in ((), theirs):  # a trainer's file does not name its camera
         source = replace(source, cameras=theirs if "dataset" in kinds_of(source.path) else ())
@@ -64,7 +62,7 @@ def open_run(run_dir: Path | str, progress: Progress = silent) -> Opened:
     loaded = stage["metrics"]["checkpoint"]
     if sum(loaded["macs_by_block"].values()) < SMALL_GMAC * 1e9:
         torch.set_num_threads(1)
-    again = load(parameters["checkpoint"], Source.loaded(parameters), progress, loaded["sha256"])
+    again = load(parameters["checkpoint"], Source.loaded(parameters), progress)
     now = again.checkpoint
     then = stage["metrics"]["recordings"].get("layout"), stage["metrics"]["split"]
     if (now.sha256, now.identity) != (loaded["sha256"], loaded["identity"]):

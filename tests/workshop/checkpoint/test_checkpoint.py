@@ -16,6 +16,7 @@ from safetensors.torch import load_file, save_file
 
 from rover_lib.onboard.errors import CheckpointError, RoverError
 from rover_lib.workshop.act import ACT, Affine, example_inputs, inputs_of, predictions
+from rover_lib.workshop.act_config import BACKBONES, ActConfig, lerobot_act, weight_shapes
 from rover_lib.workshop.checkpoint import trainer
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint, write_both
 from rover_lib.workshop.checkpoint.files import save_torch
@@ -50,7 +51,7 @@ def refused(path) -> str:
 def test_reads_the_trainers_file(tiny, tiny_file, tiny_policy, tmp_path):
     c, r = tiny.config, tiny.report
     assert (c.chunk, c.dim, c.heads, c.feedforward, c.latent, c.vae_layers) == (32, 64, 4, 128, 32, 1)
-    assert c.image_sizes == ((72, 128),) and c.action_names == ("steering", "throttle")
+    assert c.image_sizes == ((72, 128),) and c.action_names == ("steering", "throttle") and c.rate_hz == 30
     assert r["parameters"] == sum(p.numel() for p in tiny_policy.state_dict().values())
     assert r["parameters"] - r["parameters_acting"] > 0
     assert r["best_val_loss"] == pytest.approx(0.15) and r["epoch"] == 7 and json.dumps(r)
@@ -61,6 +62,19 @@ def test_reads_the_trainers_file(tiny, tiny_file, tiny_policy, tmp_path):
     older = {"data.pkl": lambda data: data.replace(b"numpy._core.multiarray", b"numpy.core.multiarray")}
     path = rewritten(tiny_file, tmp_path / "older.pth", older)
     assert load_checkpoint(path).report["best_val_loss"] == r["best_val_loss"]
+
+
+@pytest.mark.parametrize(("no", "backbone"), zip(("pre_norm", "vae_layers", "sees_state"), BACKBONES, strict=True))
+def test_shapes_are_lerobots(no, backbone):
+    every = {"pre_norm": True, "vae_layers": 2, "sees_state": True} | {no: 0}
+    config = ActConfig(dim=32, feedforward=64, latent=5, state_names=("a",), backbone=backbone, **every)
+    lerobots = lerobot_act(config, {}).model.state_dict()
+    assert weight_shapes(config) == {name: tuple(weight.shape) for name, weight in lerobots.items()}
+
+
+def test_a_trainers_file_is_checked_without_lerobots_seconds(tiny_file, monkeypatch):
+    monkeypatch.delattr("rover_lib.workshop.act_config.lerobot_act")
+    assert load_checkpoint(tiny_file).config.chunk == 32
 
 
 def test_what_is_not_needed_may_be_missing_or_odd(tiny, tiny_policy, tmp_path):

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from rover_lib.workshop.act import inputs_of
-from rover_lib.workshop.int8 import frames
+from rover_lib.workshop.int8 import frames, observe
 from rover_lib.workshop.int8.choose import Chooser
-from rover_lib.workshop.int8.observe import Calibration, _places, calibrate, restore_observed, times_of
+from rover_lib.workshop.int8.observe import Calibration, calibrate, restore_observed, times_of
 from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.int8.scheme import OBSERVERS, Scheme
 from rover_lib.workshop.judge.recorded_range import worst
@@ -46,6 +46,15 @@ def test_a_range_reaches_from_usual_frames_to_all():
         ("backbone.layer4.1.relu", 0.5, (0, math.sqrt(1.2 * 60))),
     ):
         assert frames.range_over(EXTREMES[place], frames.usual(EXTREMES, 75), wider) == pytest.approx(expected)
+
+
+def test_only_the_named_places_reach_to_all_frames(monkeypatch):
+    observers = {place: SimpleNamespace() for place in EXTREMES}
+    monkeypatch.setattr(observe, "_places", lambda graph: observers)
+    scheme = Scheme(observer="frames", usual_pct=75, wider=(("image_project", 1.0),))
+    observe.set_ranges(None, scheme, SimpleNamespace(frames=EXTREMES))
+    assert observers["image_project"].of_frames == pytest.approx((-30, 3))
+    assert observers["backbone.layer4.1.relu"].of_frames == pytest.approx((0, 1.2))
 
 
 @pytest.mark.parametrize(("costs", "is_widened"), [(1.05, True), (1.15, False)])
@@ -90,11 +99,6 @@ def test_calibration_keeps_each_frames_extremes(dazzled, jumping, jumped, tmp_pa
     inputs = [inputs_of(s, dazzled.config) for s in jumping[:4]]
     # the graph's sums may be in another order than while it observed
     assert times_of(graph, again, inputs).tolist() == pytest.approx(frames.oddest(again.frames)[:4].tolist(), rel=1e-3)
-    narrow = Scheme(observer="frames", usual_pct=87.5, wider=(("image_project", 1.0),))
-    for place, observer in _places(restore_observed(dazzled, narrow, again)).items():
-        usual = again.frames[place][frames.usual(again.frames, 87.5 if place != "image_project" else 100)]
-        expected = min(usual[:, 0].min().item(), 0), max(usual[:, 1].max().item(), 0)
-        assert observer.range() == pytest.approx(expected, abs=1e-5)
 
 
 @pytest.mark.slow

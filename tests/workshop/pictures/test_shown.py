@@ -70,6 +70,7 @@ def grey(pictures):
     [
         (frozen, "frozen_camera"),
         (blank(0), "blank_pictures"),
+        (blank(0, 1), "blank_pictures"),
         (blank(128), "blank_pictures"),
         (blank((0, 130, 0)), "blank_pictures"),
         (blank(250, 5), "blank_pictures"),
@@ -100,6 +101,15 @@ def test_drives_through_rooms_of_other_colours_are_rarely_called_swapped():
     rng = np.random.default_rng(0)
     draws = [rng.choice(len(seen), rng.integers(3, 9), replace=False) for _ in range(60)]
     assert sum(find_swapped([seen[i] for i in draw]).any() for draw in draws) <= 10
+
+
+@pytest.mark.parametrize(("factors", "named"), [((0, 1), True), ((1, 0), False)])
+def test_steering_that_never_changes_is_named_and_a_held_throttle_is_not(factors, named):
+    found = recordings(lambda pictures: pictures)
+    (first, *_) = found.episodes
+    still = replace(first, samples=tuple(replace(sample, chunk=sample.chunk * factors) for sample in first.samples))
+    cautions = replace(found, episodes=(still,)).cautions()
+    assert any("steering is 0 throughout" in caution for caution in cautions) == named
 
 
 @pytest.mark.parametrize("times", [2, 3])
