@@ -7,6 +7,7 @@ begins, and at a hole in time; its first record gives the next one its state, bu
 """
 
 import json
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -244,7 +245,7 @@ class _Tub:
             for number, line in enumerate(lines, 1):
                 place = f"{name}, line {number}"
                 try:
-                    record = _parse(line)
+                    record = _parse(line, self.path)
                 except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as e:
                     faults.add(self.path, "broken_record", f"{place}: {quote(str(e))}")
                     continue
@@ -338,12 +339,14 @@ def _read_manifest(path: Path) -> tuple[list[str], set[int]]:
         raise EpisodeError(f"{path}: lists no catalogs, too many, or no deleted records", remedy=OLDER) from None
 
 
-def _parse(text: str) -> _Record:
-    """Return the record in a line. Raises ValueError, also of other kinds, and EpisodeError for other cameras."""
+def _parse(text: str, tub: Path) -> _Record:
+    """Return the record in a line. Raises ValueError, also of other kinds, and EpisodeError for other cameras' tubs."""
     row = json.loads(text)
     if PICTURE not in row and (similar := [key for key in row if key.startswith(f"{PICTURE}_")]):
-        remedy = f"to use one, name it so in the catalogs: sed -i 's#{similar[0]}#{PICTURE}#' *.catalog"
-        raise EpisodeError(f"a record has no '{PICTURE}', as of two cameras", found=quote_all(similar), remedy=remedy)
+        catalogs = f"{shlex.quote(str(tub))}/*.catalog"
+        remedy = f"to use one, name it so in the catalogs: sed -i 's#{similar[0]}#{PICTURE}#' {catalogs}"
+        problem = f"{tub}: a record has no '{PICTURE}', as of two cameras"
+        raise EpisodeError(problem, found=quote_all(similar), remedy=remedy)
     number = row["_index"]
     ms = row.get("_timestamp_ms")
     values = (row[ANGLE], row[THROTTLE])

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import subprocess
 from pathlib import Path
 
 import cv2
@@ -70,6 +71,17 @@ def test_a_tub_that_drives_by_negative_throttle_is_asked_about(tmp_path):
     negated = read_tub(root, Car(), throttle="negated").samples
     assert all(s.chunk[0, 1] == np.float32(0.2) for s in negated[:30])
     assert all(s.chunk[0, 1] == 0 for s in read_tub(root, Car(), throttle="as-recorded").samples[:35])
+
+
+def test_a_tub_of_two_cameras_is_told_how_to_use_one(tmp_path):
+    """And what it is told makes it one that is read."""
+    root = tub(tmp_path / "a stereo tub", records(40))
+    for catalog in root.glob("*.catalog"):
+        catalog.write_text(catalog.read_text().replace('"cam/image_array"', '"cam/image_array_a"'))
+    with pytest.raises(EpisodeError, match=f"{root}: a record has no .*, as of two cameras") as e:
+        read_tub(root, Car())
+    subprocess.run(e.value.remedy[e.value.remedy.index("sed ") :], shell=True, check=True)
+    assert len(read_tub(root, Car()).samples) == 40
 
 
 def test_runs_of_a_few_records_and_odd_times_have_no_rate(tmp_path):
