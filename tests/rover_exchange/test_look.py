@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rover_exchange import film
+import rover_lib.cli  # noqa: F401  # first, as commands import it
+from rover_exchange import cli, film
 from rover_exchange.flight import flight_figure
 from rover_exchange.moments import began_s, moments_of
 from rover_lib.onboard.car.car import Car, read_car
@@ -147,3 +148,13 @@ def test_the_command_draws(tmp_path):
     assert other.read_bytes().startswith(b"%PDF")
     refused = rover("log", path, "-o", tmp_path / "other.txt")
     assert refused.exit_code == 1 and ".png" in refused.output
+
+
+@pytest.mark.parametrize("screen", ["", "DISPLAY", "WAYLAND_DISPLAY"])
+def test_a_browser_is_opened_where_there_is_a_screen(monkeypatch, screen):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.setenv(name, ":0" if name == screen else "")
+    opened = []
+    monkeypatch.setattr(cli.webbrowser, "open", opened.append)
+    cli.open_browser("http://127.0.0.1:1")
+    assert opened == (["http://127.0.0.1:1"] if screen else [])
