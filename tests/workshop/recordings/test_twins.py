@@ -47,7 +47,7 @@ def test_a_mirrored_copy_of_each_drive_is_left_out(noise, frames):
     assert "mirrored" in notes["b/t2"] and "a/e2" in notes["b/t2"] and "a/e0" in notes["again"]
 
 
-@pytest.mark.parametrize(("same", "kept"), [(6, ["e0"]), (5, ["part", "e0"])])
+@pytest.mark.parametrize(("same", "kept"), [(6, ["a/e0"]), (5, ["part", "a/e0"])])
 def test_three_of_ten_runs_of_four_actions_make_a_copy(same, kept):
     whole = drive(0)
     part = replace(drive(7), id="part", samples=whole.samples[:same] + drive(7).samples[same:13])
