@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from rover_lib.workshop.judge.compare import Fidelity
-from rover_lib.workshop.judge.recorded_range import HELD_OFF, hardly_varies
+from rover_lib.workshop.judge.recorded_range import HELD_OFF, hardly_varies, usual_size
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.recordings.samples import Sample, block_of, stack_chunks
 
@@ -93,7 +93,8 @@ class Judged:
             return ["no action varies enough in these recordings to show whether the policy sees"]
         warnings = []
         for action, result in self.actions.items():
-            for name in result.lost()[:1]:
+            if lost := result.lost():
+                name = lost[0]
                 when = " in the later half of a plan" if name == LAST else ""
                 guess = result.guesses[name]
                 errors = f"{guess.error_pct - guess.better:.2f} % off the driver{when}, {name} {guess.error_pct:.2f} %"
@@ -176,6 +177,8 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample]) -> Judged | Non
         compared[LAST] = frame_errors(states[:, None], *later), frame_errors(report.reference[:, half:], *later)
     drawn, pieces = _pieces(report)
     draws = np.random.default_rng(0).integers(0, len(pieces), (DRAWS, len(pieces)))
+    acted = recorded[~is_pad]
+    could_learn = chunks[~padded]
     actions = {}
     for i, action in enumerate(report.action_names):
         if (pct := report.pct(action)) is None:
@@ -185,10 +188,9 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample]) -> Judged | Non
         for name, (of_guess, of_policy) in ({CONSTANT: (constant, own)} | compared).items():
             if not np.isnan(of_guess[:, i]).all():
                 guesses[name] = _guess(pct * of_guess[:, i], pct * of_policy[:, i], pieces, draws)
-        acted = recorded[~is_pad][:, i]
         error = own[:, i].mean()
-        is_constant = hardly_varies(action, acted) or hardly_varies(action, chunks[~padded][:, i])
-        size = float(np.abs(acted).mean())
+        is_constant = hardly_varies(action, acted[:, i]) or hardly_varies(action, could_learn[:, i])
+        size = usual_size(acted[:, i])
         actions[action] = ActionJudged(float(pct * error), guesses, is_constant, float(error / size) if size else 0.0)
     return Judged(actions, drawn)
 

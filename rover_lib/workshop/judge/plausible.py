@@ -16,7 +16,7 @@ import numpy as np
 
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.judge.recorded_range import HELD_OFF, Range, hardly_varies
+from rover_lib.workshop.judge.recorded_range import HELD_OFF, Range, hardly_varies, usual_size
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.recordings.samples import Sample, frame_rate_hz, is_another_rate, pick_evenly, stack_chunks
 
@@ -98,7 +98,7 @@ def fits(checkpoint: Checkpoint, samples: Sequence[Sample], action_range: Mappin
         values = plans[..., i]
         acted = recorded[..., i][~is_pad]
         constant = hardly_varies(name, acted)
-        margin = max(BEYOND * (high - low), HELD_OFF * float(np.abs(acted).mean()) if constant else 0)
+        margin = max(BEYOND * (high - low), HELD_OFF * usual_size(acted) if constant else 0)
         beyond = (values < low - margin) | (values > high + margin)
         actions[name] = {
             "predicted": [float(values.min()), float(values.max())],

@@ -39,9 +39,14 @@ def not_judged(action_range: Mapping[str, Range]) -> list[str]:
     return [f"{name} never changes in these recordings: not judged" for name in constant_actions(action_range)]
 
 
+def usual_size(values: np.ndarray) -> float:
+    """The mean size of recorded values (n,) of an action."""
+    return float(np.abs(values).mean())
+
+
 def hardly_varies(action: str, values: np.ndarray) -> bool:
     """Whether an action that may be held is nearly constant in its recorded values (n,)."""
-    return action == HELD and float(np.abs(values - np.median(values)).mean()) <= HARDLY * float(np.abs(values).mean())
+    return action == HELD and float(np.abs(values - np.median(values)).mean()) <= HARDLY * usual_size(values)
 
 
 def follows(moved_pct: float, apart_pct: float) -> bool:
