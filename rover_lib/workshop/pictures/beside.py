@@ -30,13 +30,11 @@ def find_swapped(drives: Sequence[np.ndarray]) -> np.ndarray:
     coloured = np.linalg.norm((hues - swapped).reshape(len(hues), -1), axis=1) > COLOURED
     if coloured.sum() < LEAST_DRIVES or coloured.mean() < MOST_OF:
         return np.zeros(len(drives), bool)
-    side, nearer = _turned(hues, swapped)
-    odd = side & coloured & ((nearer > UNLIKE)[coloured].mean() >= MOST_OF)
-    as_they_are, turned = (values.reshape(len(hues), -1) for values in (hues, swapped))
-    right = np.where(side[:, None], turned, as_they_are)
+    side, right, wrong = _turned(hues, swapped)
+    odd = side & coloured & ((_nearer(right, wrong) > UNLIKE)[coloured].mean() >= MOST_OF)
     for i in np.flatnonzero(odd):
         others = np.delete(right, i, axis=0).mean(0)
-        once_turned, before = _cosine(np.stack([turned[i], as_they_are[i]]), others)
+        once_turned, before = _cosine(np.stack([right[i], wrong[i]]), others)
         odd[i] = once_turned > TURNED_LEAST and once_turned - before > TURNED_NEARER
     return odd
 
@@ -46,17 +44,18 @@ def find_upside_down(drives: Sequence[np.ndarray]) -> np.ndarray:
     rows = np.array([_rows(pictures) for pictures in drives])
     rows -= rows.mean(2, keepdims=True)
     rows /= np.sqrt((rows**2).mean((0, 2), keepdims=True)) + 1e-6
-    side, nearer = _turned(rows, rows[:, :, ::-1])
+    side, *descriptions = _turned(rows, rows[:, :, ::-1])
     # Walls may be darker than the floor or brighter: what is told by brightness alone is not sure.
-    by_texture, nearer_by_texture = _turned(rows[:, 1:4], rows[:, 1:4, ::-1])
+    by_texture, *textures = _turned(rows[:, 1:4], rows[:, 1:4, ::-1])
     if (side == by_texture).mean() < MOST_OF:
         return np.zeros(len(drives), bool)
-    return side & by_texture & (np.minimum(nearer, nearer_by_texture) > UNLIKE)
+    return side & by_texture & (np.minimum(_nearer(*descriptions), _nearer(*textures)) > UNLIKE)
 
 
-def _turned(features: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which drives are nearer to the others when they are turned, the fewer ones, and how much nearer.
+def _turned(features: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which drives are nearer to the others when they are turned, the fewer ones, (n,) bool.
 
+    And the drives' descriptions, (n, values), the right way round and the wrong way round.
     features, turned: (n, ...) descriptions of the drives, as they are and turned.
     """
     features, turned = (values.reshape(len(values), -1) for values in (features, turned))
@@ -67,8 +66,13 @@ def _turned(features: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.nd
     differ = signs * np.sign(signs.sum()) < 0
     right = np.where(differ[:, None], turned, features)
     wrong = np.where(differ[:, None], features, turned)
+    return differ, right, wrong
+
+
+def _nearer(right: np.ndarray, wrong: np.ndarray) -> np.ndarray:
+    """Return how much nearer, (n,), each right description is to their mean than the wrong one."""
     usual = right.mean(0)
-    return differ, _cosine(right, usual) - _cosine(wrong, usual)
+    return _cosine(right, usual) - _cosine(wrong, usual)
 
 
 def _cosine(vectors: np.ndarray, one: np.ndarray) -> np.ndarray:
