@@ -496,10 +496,11 @@ def open_view(
     from rover_lib.onboard.view.server import Address, View, read_token
 
     token = read_token(token_file) if token_file else secrets.token_urlsafe(16)
-    place: Path | None = feed or default_view()
+    place = None
     of_simulation = {}
-    if shown:
-        place = None
+    if not shown:
+        place = feed or default_view()
+    else:
         of_simulation = {"car": shown.car, "ask": shown.ask, "script": shown.script}
     view = View(Address(web_port, interface), token, place, drive_user=drive_user, **of_simulation)
 
