@@ -18,8 +18,8 @@ class Level:
     bearing_rad: the balloon's from the start, at most, to either side; the camera sees 0.67. gain: of the light, by
     `flicker` at most, at flicker_hz times 2 pi. tint: at most, of each colour. glare: 0 to 255, at its middle.
     hidden: share of worlds in which something stands before the balloon, and hidden_share: of the balloon's width
-    behind it. alike: share of worlds with balloons, a floor and a wall that have the balloon's colour. decoys: red
-    things that are no balloons, at most. solid: whether touching a thing ends the drive.
+    behind it. alike: share of worlds with balloons, a floor and a wall that have the balloon's colour. decoys: other
+    red things, at most. solid: whether the drive ends when the car touches one of the things in its way.
     shoves: at least, in each drive; drags: share of them that last long, as on a slope. speed, steering: what the car
     makes of a command, as a factor. slip_s: how long the car's direction lags behind its heading.
     """
