@@ -1,35 +1,25 @@
 """`rover view` as a user sees it, in a real browser of a phone's size: its pictures, its buttons, a lost connection."""
 
 import re
-import shutil
 import signal
 import subprocess
-import sys
-from contextlib import ExitStack
 
 import pytest
 
 pytest.importorskip("aiohttp", reason="needs the extra look")
 
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import expect
 
-CHROMIUM = shutil.which("chromium")
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(not CHROMIUM, reason="needs the Debian package chromium")]
+from tests.helpers.browser import chromium, served_to_a_browser
+
+pytestmark = [pytest.mark.slow, chromium]
 PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 2, "is_mobile": True}
-PATIENT_MS = 120_000  # this machine may be busy
 
 
 def test_a_simulation_on_a_phone(demo_run):
     """What `make watch` shows, by the page's own Content-Security-Policy."""
-    words = ["-m", "rover_lib.cli", "view", demo_run / "policy_static.pt", "--web-port", "0"]
-    expect.set_options(timeout=PATIENT_MS)
-    with (
-        subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, text=True) as shown,
-        ExitStack() as stack,
-        sync_playwright() as driver,
-        driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"]) as browser,
-    ):
-        stack.callback(shown.terminate)
+    words = ["view", demo_run / "policy_static.pt", "--web-port", "0"]
+    with served_to_a_browser(*words, stdout=subprocess.PIPE) as (shown, browser):
         page = browser.new_page(**PHONE)
         page.goto(shown.stdout.readline().strip())
         phase, said = page.locator("#phase"), page.locator("#missing")

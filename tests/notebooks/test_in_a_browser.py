@@ -3,17 +3,16 @@
 import re
 import shutil
 import subprocess
-import sys
 import threading
 from contextlib import ExitStack
 
 import pytest
-from playwright.sync_api import Page, expect, sync_playwright
+from playwright.sync_api import Page, expect
 
-CHROMIUM = shutil.which("chromium")
-pytestmark = [pytest.mark.release, pytest.mark.skipif(not CHROMIUM, reason="needs the Debian package chromium")]
+from tests.helpers.browser import PATIENT_MS, chromium, served_to_a_browser
+
+pytestmark = [pytest.mark.release, chromium]
 NAME = "in-a-browser"
-PATIENT_MS = 120_000  # a notebook is run, and this machine may be busy
 ADDRESS = re.compile(r"http://localhost\S+token=\S+")
 WITHOUT_MODEL = "Error displaying widget"
 
@@ -25,16 +24,10 @@ def open_notebook(page: Page, address: str) -> None:
 
 
 def test_the_slider_moves_the_picture_and_a_notebook_opens_again(demo_run):
-    words = ["-m", "rover_lib.cli", "notebooks", str(demo_run), "--as", NAME]
-    expect.set_options(timeout=PATIENT_MS)
-    with (
-        subprocess.Popen([sys.executable, *words], stderr=subprocess.PIPE, text=True) as lab,
-        ExitStack() as stack,
-        sync_playwright() as driver,
-        driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"]) as browser,
-    ):
+    words = ["notebooks", demo_run, "--as", NAME]
+    with ExitStack() as stack:
         stack.callback(shutil.rmtree, demo_run.parent / NAME)
-        stack.callback(lab.kill)  # it asks before it ends
+        lab, browser = stack.enter_context(served_to_a_browser(*words, stderr=subprocess.PIPE))
         address = next(found[0] for line in lab.stderr if (found := ADDRESS.search(line)))
         threading.Thread(target=lab.stderr.read, daemon=True).start()
         page = browser.new_page(viewport={"width": 1400, "height": 1000})
