@@ -15,6 +15,7 @@ NAME ?= mine
 # Of the balloon worlds to look at: easy or hard. The page can change it.
 LEVEL ?= easy
 DEMO := runs/demo/.made
+SOURCES := $(sort $(shell find rover_lib rover_learn balloon_world notebooks -name '*.py' -o -name '*.ipynb' -o -name '*.html')) $(wildcard params.yml car.yml)
 # A container may have no user but root. Root may load artifacts here, as they were made here; see onboard/policy/confine.py.
 export ROVER_AS_ROOT := 1
 # Some container images forbid Python to store its bytecode; then every process compiles torch again, which takes 2 s.
@@ -67,7 +68,7 @@ demo: $(READY)
 	$(ROVER) world record runs/demo/episodes
 	$(ROVER) train runs/demo/episodes runs/demo/best_model.pth $(DEMO_TRAINING)
 	$(ROVER) run runs/demo/best_model.pth runs/demo/episodes --name demo --worlds 40
-	@touch $(DEMO)
+	@sha256sum $(SOURCES) > $(DEMO)
 	@echo
 	@echo 'its notebooks, in JupyterLab:   make notebooks-open NAME=demo'
 	@echo 'late plans, a smaller policy:   make demo-more'
@@ -97,9 +98,10 @@ lint: $(READY)
 	PATH='$(CURDIR)/$(VENV)/bin':"$$PATH" ANSIBLE_HOME='$(CURDIR)/runs/ansible' ansible-lint --offline --profile=production --strict -q ansible
 
 # The tests use the demo as their example of a whole run, and tests/test_demo.py holds it to the gates of params.yml.
-# The demo takes minutes, and most changes are to tests; so it is made again only if one of its sources has changed.
-$(DEMO): $(READY) $(shell find rover_lib rover_learn balloon_world notebooks -name '*.py' -o -name '*.ipynb' -o -name '*.html') $(wildcard params.yml car.yml)
-	$(MAKE) demo
+# The demo takes minutes, and most changes are to tests; so it is made again only if one of its sources says something
+# else than before, and not for one that was only opened and saved.
+$(DEMO): $(READY) $(SOURCES)
+	@sha256sum $(SOURCES) | cmp --silent - $(DEMO) && touch $(DEMO) || $(MAKE) demo
 
 # Some tests call make, for which it does not matter how this one was called.
 test: lint $(DEMO)
@@ -134,7 +136,7 @@ mutants: $(READY)
 
 # Without NAME it opens the repository's notebooks.
 notebooks-open: $(READY)
-	$(if $(filter file,$(origin NAME)),$(VENV)/bin/python -m jupyterlab $(if $(filter 0,$(shell id -u)),--allow-root) notebooks,$(ROVER) notebooks 'runs/$(NAME)' $(if $(filter default,$(origin AS)),,--as '$(AS)'))
+	$(if $(filter file,$(origin NAME)),JUPYTER_CONFIG_PATH='$(CURDIR)/rover_lib/workshop/jupyter' $(VENV)/bin/python -m jupyterlab $(if $(filter 0,$(shell id -u)),--allow-root) notebooks,$(ROVER) notebooks 'runs/$(NAME)' $(if $(filter default,$(origin AS)),,--as '$(AS)'))
 
 notebooks: demo demo-more
 	$(VENV)/bin/python -m lab.repository.publish

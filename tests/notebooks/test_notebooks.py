@@ -205,15 +205,28 @@ def test_each_parameter_that_is_turned_is_seen_in_the_json(turned):
     assert run_report.write(turned)["metrics"]["modes"]
 
 
+def words_of_the_page(command):
+    """Return the words of the page's only line that begins with the command, and an environment that finds it."""
+    page = (NOTEBOOKS.parent / "docs" / "notebooks.md").read_text()
+    (line,) = (line.strip() for line in page.splitlines() if line.startswith(f"    {command} "))
+    env = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    return line.split(), {"cwd": NOTEBOOKS.parent, "env": env, "check": True}
+
+
 @pytest.mark.release  # a minute
 def test_papermill_turns_a_parameter_as_the_page_types_it(demo_run, tmp_path):
     shutil.copytree(demo_run, tmp_path / "try1", ignore=shutil.ignore_patterns("episodes", "*.pth"))
     there = {"runs/try1": str(tmp_path / "try1"), "out.ipynb": str(tmp_path / "out.ipynb")}
-    page = (NOTEBOOKS.parent / "docs" / "notebooks.md").read_text()
-    (line,) = (line.strip() for line in page.splitlines() if line.startswith("    papermill "))
-    words = [there.get(word, word) for word in line.split()]
-    env = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
-    subprocess.run([*words, "-p", "held_out_frames", "8"], cwd=NOTEBOOKS.parent, env=env, check=True)
+    words, options = words_of_the_page("papermill")
+    words = [there.get(word, word) for word in words]
+    subprocess.run([*words, "-p", "held_out_frames", "8"], **options)
     compared = json.loads((tmp_path / "try1" / "compare.json").read_text())
     assert compared["metrics"]["fp32"]["trials"] == 10
     assert (tmp_path / "out.ipynb").is_file()
+
+
+@pytest.mark.release  # half a minute
+def test_nbval_runs_a_notebook_as_the_page_types_it(demo_run):
+    words, options = words_of_the_page("pytest")
+    assert "--nbval" in words
+    subprocess.run(words, **options)
