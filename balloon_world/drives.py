@@ -265,7 +265,9 @@ def judge(
     def row(policy: Policy, question: tuple[str, int]) -> dict[str, Any]:
         return {"outcome": one(policy, *question)}
 
-    questions = [(kind, SEED + i) for kind, count in worlds.items() for i in range(count)]
+    questions: list[tuple[str, int]] = []
+    for kind, count in worlds.items():
+        questions += [(kind, SEED + i) for i in range(count)]
     rows = drive_missing(artifact, questions, row, path, progress, f"driving {name}")
     return {kind: [rows[kind, SEED + i]["outcome"] for i in range(count)] for kind, count in worlds.items()}
 

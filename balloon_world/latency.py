@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +107,8 @@ def _count_outcomes(drives: Sequence[WorldDrive]) -> dict[str, Any]:
     counts = count_hits(outcomes) | {
         outcome: outcomes.count(outcome) for outcome in ("left", "bumped", "timeout", "stopped")
     }
-    ages_ms = 1e3 * np.array([o.age_s for d in drives for o in d.orders])
+    orders = chain.from_iterable(d.orders for d in drives)
+    ages_ms = 1e3 * np.array([order.age_s for order in orders])
     for name, q in (("min", 0), ("p50", 50), ("p95", 95), ("max", 100)):
         counts[f"plan_age_{name}_ms"] = round(float(np.percentile(ages_ms, q)), 3) if len(ages_ms) else None
     return counts

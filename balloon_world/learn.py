@@ -240,9 +240,11 @@ class _Lab:
             return experiment.drive(policy, world)
 
         counts = {kind: experiment.worlds if kind == PUSHED else experiment.other_worlds for kind in HOW}
-        artifacts = [(arm, number, self._learned(arm, number)) for arm in ARMS for number in range(1, len(rounds) + 1)]
+        artifacts = [(BEFORE, 0, self.run_dir / ARTIFACT)]
+        for arm in ARMS:
+            artifacts += [(arm, number, self._learned(arm, number)) for number in range(1, len(rounds) + 1)]
         rows = []
-        for arm, number, artifact in [(BEFORE, 0, self.run_dir / ARTIFACT), *artifacts]:
+        for arm, number, artifact in artifacts:
             name = _name(arm, number) if number else BEFORE
             outcomes_by_kind = judge(artifact, counts, one, self.folder / f"{name}.jsonl", self.progress, name)
             human_s = float(sum(r["human_s"] for r in rounds[:number]))

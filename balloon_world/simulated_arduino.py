@@ -92,7 +92,9 @@ class StandIn:
         self._boot += 1
         self._sequence = 0
         self._lowered_us = self._cap_us = 65535
-        self._result, self._state, self._reason = "-", "M", "r"
+        self._result = "-"
+        self._state = "M"
+        self._reason = "r"
         self._rest = b""  # of a line that has not ended
         self._started = time.monotonic()
         self._commanded = self._status_due = 0.0
@@ -157,7 +159,8 @@ class StandIn:
     def _command(self, body: str) -> None:
         if body == ">Q":
             return self._hello()
-        kind, boot, sequence, *numbers = body[1:2], *map(int, body[2:].split())
+        kind = body[1:2]
+        boot, sequence, *numbers = map(int, body[2:].split())
         if boot != self._boot or sequence <= self._sequence:
             self._result = "o"
         else:
@@ -176,8 +179,10 @@ class StandIn:
         elif kind == "L":
             self._lowered_us = self._cap_us = min(self._cap_us, abs(numbers[0] - self._neutral[1]))
         elif kind == "D":
-            self._commanded, (_, steering_us, throttle_us) = time.monotonic(), numbers
-            low_us, high_us = self._neutral[1] - self._cap_us, self._neutral[1] + self._cap_us
+            self._commanded = time.monotonic()
+            _, steering_us, throttle_us = numbers
+            low_us = self._neutral[1] - self._cap_us
+            high_us = self._neutral[1] + self._cap_us
             self._set_pins(steering_us, min(max(throttle_us, low_us), high_us))
         elif not armed:  # arming again while armed does not renew the deadline
             self._commanded = time.monotonic()
@@ -194,7 +199,8 @@ class StandIn:
         self._set_pins(*self._neutral)
 
     def _enter(self, state: str, reason: str) -> None:
-        self._state, self._reason = state, reason
+        self._state = state
+        self._reason = reason
         self._set_pins(*self._neutral)
 
     def _set_pins(self, *pulses: int) -> None:

@@ -9,6 +9,7 @@ params.yml, and recommends a student or the teacher.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -209,7 +210,7 @@ def recommendation(rows: Sequence[Mapping[str, Any]], limits: Mapping[str, Any])
     key = "gmac" if any(row["instructions_g"] is None for row in rows) else "instructions_g"
     passing = [row for row in students if all(g["passed"] for g in gates[row["name"]])]
     fastest = min(passing, key=lambda row: row[key], default=teacher)
-    return {"name": fastest["name"], "fastest_by": key, "gates": [g for its_gates in gates.values() for g in its_gates]}
+    return {"name": fastest["name"], "fastest_by": key, "gates": list(chain.from_iterable(gates.values()))}
 
 
 def table(metrics: Mapping[str, Any]) -> Table:

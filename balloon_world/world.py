@@ -125,9 +125,10 @@ class World:
         self.level = level
         rng = np.random.default_rng([seed, 20_251])
         self.state = CarState()
-        distance, bearing = rng.uniform(*level.distance_m), rng.uniform(-level.bearing_rad, level.bearing_rad)
+        distance = rng.uniform(*level.distance_m)
+        bearing = rng.uniform(-level.bearing_rad, level.bearing_rad)
         red = (int(rng.integers(20, 50)), int(rng.integers(15, 45)), int(rng.integers(190, 240)))
-        x, y = distance * math.cos(bearing), distance * math.sin(bearing)
+        x, y = _point(distance, bearing)
         self.balloon = Thing("balloon", x, y, BALLOON_RADIUS_M, BALLOON_HEIGHT_M, red)
         self.distractors = tuple(_distractors(rng, self.balloon))
         more = np.random.default_rng([seed, 20_254])
@@ -221,7 +222,7 @@ class World:
     def seen(self, thing: Thing) -> tuple[float, float]:
         """Return a thing's distance in metres and its bearing in radians from the camera."""
         ahead_m, left_m = self._local(thing.x_m, thing.y_m)
-        return math.hypot(ahead_m, left_m), math.atan2(left_m, ahead_m)
+        return _polar(ahead_m, left_m)
 
     def _local(self, x_m: float, y_m: float) -> tuple[float, float]:
         dx, dy = x_m - self.state.x_m, y_m - self.state.y_m
@@ -295,13 +296,23 @@ def _around(world: World, distance: float, bearing: float) -> float:
     return bearing
 
 
+def _polar(x_m: float, y_m: float) -> tuple[float, float]:
+    """Return a point's distance and its bearing in radians."""
+    return math.hypot(x_m, y_m), math.atan2(y_m, x_m)
+
+
+def _point(distance: float, bearing: float) -> tuple[float, float]:
+    return distance * math.cos(bearing), distance * math.sin(bearing)
+
+
 def _distractors(rng: np.random.Generator, balloon: Thing) -> Iterator[Thing]:
     for _ in range(int(rng.integers(2, 7))):
         kind = str(rng.choice(["balloon", "box", "cone"]))
         base = _DISTRACTOR_BGR[int(rng.integers(len(_DISTRACTOR_BGR)))]
         blue, green, red = (int(c) for c in np.clip(np.array(base) * rng.uniform(0.75, 1.2), 0, 255))
-        distance, bearing = rng.uniform(1.2, 6.0), rng.uniform(-0.9, 0.9)
-        x, y = distance * math.cos(bearing), distance * math.sin(bearing)
+        distance = rng.uniform(1.2, 6.0)
+        bearing = rng.uniform(-0.9, 0.9)
+        x, y = _point(distance, bearing)
         radius = rng.uniform(0.10, 0.18)
         height = rng.uniform(0.2, 0.4) if kind == "balloon" else rng.uniform(0.15, 0.45)
         to_balloon = math.hypot(balloon.x_m, balloon.y_m)
@@ -319,26 +330,26 @@ def _nearly_red(rng: np.random.Generator, thing: Thing) -> Thing:
 
 def _hider(rng: np.random.Generator, balloon: Thing, hidden_share: float) -> Thing:
     """Return what stands on the way to the balloon and hides this share of its width from the start."""
-    to_balloon, bearing = math.hypot(balloon.x_m, balloon.y_m), math.atan2(balloon.y_m, balloon.x_m)
+    to_balloon, bearing = _polar(balloon.x_m, balloon.y_m)
     kind = str(rng.choice(["balloon", "box", "cone"]))
     colour = (*_DISTRACTOR_BGR, *_NEARLY_RED_BGR)[int(rng.integers(len(_DISTRACTOR_BGR) + len(_NEARLY_RED_BGR)))]
     radius = rng.uniform(0.10, 0.16)
     distance = to_balloon * rng.uniform(0.5, 0.65)
     widths = balloon.radius_m / to_balloon, radius / distance
     aside = rng.choice([-1.0, 1.0]) * (sum(widths) - 2 * hidden_share * widths[0])
-    x, y = distance * math.cos(bearing + aside), distance * math.sin(bearing + aside)
+    x, y = _point(distance, bearing + aside)
     return Thing(kind, x, y, radius, rng.uniform(0.24, 0.45), colour)
 
 
 def _decoys(rng: np.random.Generator, balloon: Thing, count: int) -> Iterator[Thing]:
     """Yield boxes and cones in a balloon's red, about as far away as the balloon and well beside the way to it."""
-    to_balloon, bearing = math.hypot(balloon.x_m, balloon.y_m), math.atan2(balloon.y_m, balloon.x_m)
+    to_balloon, bearing = _polar(balloon.x_m, balloon.y_m)
     for _ in range(count):
         kind = str(rng.choice(["box", "cone"]))
         aside = rng.choice([-1.0, 1.0]) * rng.uniform(DECOY_ASIDE_RAD, 2 * DECOY_ASIDE_RAD)
         distance = to_balloon * rng.uniform(0.8, 1.2)
         red = (int(rng.integers(20, 50)), int(rng.integers(15, 45)), int(rng.integers(190, 240)))
-        x, y = distance * math.cos(bearing + aside), distance * math.sin(bearing + aside)
+        x, y = _point(distance, bearing + aside)
         yield Thing(kind, x, y, rng.uniform(0.10, 0.18), rng.uniform(0.2, 0.45), red)
 
 
@@ -393,8 +404,10 @@ def _wall(rng: np.random.Generator) -> np.ndarray:
     wall = np.broadcast_to(top * (1 - ramp) + bottom * ramp, (HORIZON_ROW, width, 3)).astype(np.float32)
     wall = np.ascontiguousarray(np.clip(wall, 0, 255).astype(np.uint8))
     for _ in range(int(rng.integers(4, 18))):
-        x, y = int(rng.integers(0, width - 160)), int(rng.integers(0, 100))
-        w, h = int(rng.integers(20, 160)), int(rng.integers(15, 110))
+        x = int(rng.integers(0, width - 160))
+        y = int(rng.integers(0, 100))
+        w = int(rng.integers(20, 160))
+        h = int(rng.integers(15, 110))
         grey = rng.uniform(40, 210)
         colour = np.clip(grey + rng.uniform(-35, 35, 3), 0, 255)
         cv2.rectangle(wall, (x, y), (x + w, min(y + h, HORIZON_ROW - 4)), colour.tolist(), cv2.FILLED)

@@ -77,8 +77,11 @@ def usual_rate_hz(recordings: Recordings) -> float:
     Raises EpisodeError if they differ: a dataset has only one rate.
     """
     longest = max(len(e.samples) for e in recordings.episodes)
-    long = [e for e in recordings.episodes if len(e.samples) >= min(longest, LEAST_RATED)]
-    rates = {e.id: rate_hz for e in long if (rate_hz := recorded_as.frame_rate_hz(e.samples)) is not None}
+    rates: dict[str, float] = {}
+    for episode in recordings.episodes:
+        rate_hz = recorded_as.frame_rate_hz(episode.samples)
+        if rate_hz is not None and len(episode.samples) >= min(longest, LEAST_RATED):
+            rates[episode.id] = rate_hz
     if not rates:
         raise EpisodeError(f"{recordings.root}: no episode of two frames", remedy="record longer ones")
     usual_hz = float(np.median(list(rates.values())))

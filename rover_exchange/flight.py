@@ -44,7 +44,11 @@ def flight_figure(flight: Flight) -> Figure:
             ax.axvline(event.t_s, color=BLACK, lw=0.8, ls=":", zorder=0.5)
         if ax.get_legend_handles_labels()[0]:  # above the axes, where no line can run through it
             ax.legend(loc="lower left", bbox_to_anchor=(0, 0.97), ncols=4, frameon=False, fontsize=9)
-    start_s, end_s = (float(t_s[0]), max(t_s[-1], *(e.t_s for e in flight.events), 1.0)) if len(t_s) else (0.0, 1.0)
+    start_s = 0.0
+    end_s = 1.0
+    if len(t_s):
+        start_s = float(t_s[0])
+        end_s = max(t_s[-1], *(e.t_s for e in flight.events), 1.0)
     axes[-1, 0].set_xlim(max(0.0, start_s - 0.02 * (end_s - start_s)), end_s)  # without what was before the first tick
     axes[-1, 0].set_xlabel("time since the start (s)", fontsize=10)
     fig.align_ylabels(axes[:, 0])

@@ -100,7 +100,8 @@ def write_kit(run_dir: Path | str, progress: Progress = silent) -> dict[str, Any
     """
     loaded = open_run(run_dir, progress)
     policy = ACT(loaded.checkpoint.config, loaded.checkpoint.weights)
-    config, (front, rest) = policy.config, halves(policy)
+    config = policy.config
+    front, rest = halves(policy)
     calibration_frames, _ = choose_calibration(loaded.parts.calibration, SAMPLES, params()["calibration"]["seed"])
     held_out_frames = pick_evenly(loaded.parts.held_out, JUDGED)
     gap = _gap(
@@ -150,7 +151,8 @@ def _gap(policy: ACT, front: bytes, rest: bytes, inputs: list[tuple[Tensor, ...]
 
 def model_script(config: ActConfig, samples: int) -> str:
     """Return the .alls file: the chip normalises pixels itself, and features leave it in 16 bits."""
-    mean, std = zero_colour(config.image_norm[0]), [255 / scale for scale in config.image_norm[0].scale]
+    mean = zero_colour(config.image_norm[0])
+    std = [255 / scale for scale in config.image_norm[0].scale]
     lines = [
         f"normalization1 = normalization({[round(v, 6) for v in mean]}, {[round(v, 6) for v in std]})",
         f"model_optimization_config(calibration, batch_size=8, calibset_size={samples})",

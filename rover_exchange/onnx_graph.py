@@ -67,7 +67,9 @@ class _Writer(Interpreter):
 
     def model(self, outputs: Sequence[Tensor]) -> onnx.ModelProto:
         """Return the ONNX model of the graph that has run. outputs: what it returned."""
-        used = {name for node in self._nodes for name in node.input}
+        used = set[str]()
+        for node in self._nodes:
+            used.update(node.input)
         graph = helper.make_graph(
             self._nodes,
             "policy",

@@ -168,7 +168,8 @@ class Distillation(Work):
         recordings = self.opened.recordings
         held_out, choosing = (pick_evenly(part, self.recipe.judged_frames) for part in (parts.held_out, parts.choosing))
         of_teacher = "teacher", teacher.config, teacher.weights, None
-        teacher_plans, students = [], []
+        teacher_plans = []
+        students = []
         for named, config, weights, share in (of_teacher, (name, self.config, learned.weights, self.share)):
             policy = self.machine.taking(BatchedPolicy(config, weights))
             row = {"name": named, **dict(zip(("height", "width"), config.image_sizes[0], strict=True))}
@@ -214,7 +215,12 @@ def summary(content: Mapping[str, Any]) -> str:
     actions = [key.removeprefix("teacher_").removesuffix("_pct") for key in metrics["students"][0] if "teacher_" in key]
     lines = [f"errors on held-out episodes, % of the recorded range ({' / '.join(actions)})"]
     for row in metrics["students"]:
-        to = [[format_pct(row[f"{to}_{a}_pct"]).strip() for a in actions] for to in ("teacher", "recorded")]
-        errors = f"{' / '.join(to[0])} to the teacher, {' / '.join(to[1])} to the recordings"
-        lines.append(f"{row['name']}: {shape_of(row)}, {row['gmac']:.2f} GMAC: {errors}")
+        policy = f"{row['name']}: {shape_of(row)}, {row['gmac']:.2f} GMAC"
+        to_teacher = _errors(row, "teacher", actions)
+        to_recorded = _errors(row, "recorded", actions)
+        lines.append(f"{policy}: {to_teacher} to the teacher, {to_recorded} to the recordings")
     return "\n".join([*lines, metrics["note"]])
+
+
+def _errors(row: Mapping[str, Any], to: str, actions: list[str]) -> str:
+    return " / ".join(format_pct(row[f"{to}_{action}_pct"]).strip() for action in actions)

@@ -37,7 +37,7 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.recording.episode import HUMAN
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
-from rover_lib.workshop.judge.recorded_range import format_pct, not_judged, pct_of_range
+from rover_lib.workshop.judge.recorded_range import Range, format_pct, not_judged, pct_of_range
 from rover_lib.workshop.pictures.shown import with_faults
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
@@ -99,8 +99,11 @@ def finetune(
     recipe = recipe or FinetuneRecipe.of()
     parent, read = _open(checkpoint, [Source.of(path) for path in episodes], progress)
     material = _part_episodes(read, recipe)
-    ranges = [r.action_range() for r in read]
-    both = {name: (min(r[name][0] for r in ranges), max(r[name][1] for r in ranges)) for name in ranges[0]}
+    both: dict[str, Range] = {}
+    for recordings in read:
+        for action, (low, high) in recordings.action_range().items():
+            lowest, highest = both.get(action, (low, high))
+            both[action] = (min(low, lowest), max(high, highest))
     options: dict[str, Any] = {"recipe": recipe, "machine": machine, "progress": progress, "action_range": both}
     return Finetuning(origin=parent, config=parent.config, material=material, **options).make(folder)
 
@@ -116,7 +119,8 @@ def human_samples(episode: Episode) -> tuple[Sample, ...]:
     if all(s.driver == HUMAN for s in episode.samples):
         return episode.samples
     samples: list[Sample] = []
-    lasts, following = 0, None  # for how many frames from each one on a human drives
+    lasts = 0  # for how many frames from each one on a human drives
+    following: int | None = None
     for s in reversed(episode.samples):
         if s.driver == HUMAN:
             lasts = lasts + 1 if following == s.row + 1 else 1
@@ -165,7 +169,10 @@ def _part_episodes(read: tuple[Recordings, ...], recipe: FinetuneRecipe) -> _Mat
     new = [(read[0], e) for e in read[0].episodes if e.by_policy]
     for recordings in read[1:]:
         new += [(recordings, e) for e in recordings.episodes]
-    corrected = [(r, e) for r, e in new if any(s.driver == HUMAN for s in e.samples)]
+    corrected = []
+    for recordings, episode in new:
+        if any(s.driver == HUMAN for s in episode.samples):
+            corrected.append((recordings, episode))
     if not corrected:
         remedy = "give the new recordings after the old ones, with drives in which a human took over"
         raise TrainingError("no human drove in a new episode", found=f"{len(new)} new episodes", remedy=remedy)
@@ -191,12 +198,14 @@ def _part_episodes(read: tuple[Recordings, ...], recipe: FinetuneRecipe) -> _Mat
             if source is recordings and i not in judges:
                 by_kind[CORRECTIONS if episode.by_policy else ADDITIONS] += human_samples(episode)
         taught += [(kind, tuple(samples)) for kind, samples in by_kind.items()]
-    watched = chain.from_iterable(e.samples for e in (*old, *(e for _, e in new)))
+    left_out = 0
+    for episode in (*old, *(e for _, e in new)):
+        left_out += sum(s.driver != HUMAN for s in episode.samples)
     return _Material(
         read,
         tuple((kind, pick_evenly(samples, recipe.samples)) for kind, samples in taught if samples),
         tuple(entry for entry in held_out if entry[2]),
-        sum(s.driver != HUMAN for s in watched),
+        left_out,
     )
 
 
@@ -241,7 +250,8 @@ class Finetuning(Work):
 
     def learn(self) -> Learned:
         """Train both phases. What the policy sees in each of the recordings stays cached for its next training."""
-        recipe, parent = self.recipe, self.origin
+        recipe = self.recipe
+        parent = self.origin
         all_lessons = []
         for kind, samples in self.material.taught:
             folder = cache_for("lessons", self.sees(samples) | {"kind": kind})
@@ -291,8 +301,10 @@ class Finetuning(Work):
         """Judge the policy, and write its files and finetune.json."""
         material = self.material
         rows = self.judge(learned.weights)
-        old = chain.from_iterable(row.items() for row in rows if row["kind"] == OLD)
-        errors = [error for key, error in old if key.startswith("after_") and error is not None]
+        errors = []
+        for row in rows:
+            if row["kind"] == OLD:
+                errors += [row[key] for key in row if key.startswith("after_") and row[key] is not None]
         loss = float(np.mean(errors)) / 100 if errors else float("nan")
         hashes = self.write_policy(new, name, learned, loss, material.recordings[-1].root.name)
         counts = dict.fromkeys(TAUGHT, 0) | {"not_imitated": material.left_out}
@@ -365,14 +377,20 @@ def verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _judge(kinds: Mapping[str, Any]) -> tuple[bool | None, str]:
-    scarce = {k: f"{kinds[k]['episodes']} {k}" for k in KINDS if kinds[k]["episodes"] < LEAST_EPISODES}
-    sure_changes = {k: kinds[k]["change_points"] for k in KINDS if k not in scarce and kinds[k]["chance"] < CHANCE}
+    scarce: list[str] = []
+    sure_changes: dict[str, float] = {}
+    for kind in KINDS:
+        figures = kinds[kind]
+        if figures["episodes"] < LEAST_EPISODES:
+            scarce.append(f"{figures['episodes']} {kind}")
+        elif figures["chance"] < CHANCE:
+            sure_changes[kind] = figures["change_points"]
     if sure_changes.get(OLD, 0) > 0:
         return False, f"not better: on the old episodes it is {sure_changes[OLD]:.2f} points further from the human"
     if sure_changes.get(NEW, 0) > 0:
         return False, f"worse: on the new episodes it is {sure_changes[NEW]:.2f} points further from the human"
     if scarce:
-        return None, f"undecided: {' and '.join(scarce.values())} held-out episodes, of at least {LEAST_EPISODES} each"
+        return None, f"undecided: {' and '.join(scarce)} held-out episodes, of at least {LEAST_EPISODES} each"
     if NEW not in sure_changes:
         return None, "undecided: on the new episodes the difference may be chance"
     nearer = -sure_changes[NEW]

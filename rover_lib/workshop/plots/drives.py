@@ -52,6 +52,9 @@ def pushed_paths(drives: Mapping[str, Sequence[Any]]) -> Figure | style.Note:
     if not drives:
         return style.Note("nothing was driven with pushes")
     fig, fields = style.figure_of(len(drives), 3, 3.6)
+    for ax in fields[1:]:  # on one scale
+        ax.sharex(fields[0])
+        ax.sharey(fields[0])
     for ax, (title, driven) in zip(fields, drives.items(), strict=True):
         _balloons(ax, [drive.balloon for drive in driven])
         for drive in driven:
