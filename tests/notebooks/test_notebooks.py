@@ -18,6 +18,7 @@ from rover_lib.workshop.run import run as runs
 from rover_lib.workshop.run import run_report
 from rover_lib.workshop.run.run import NOTEBOOKS, parameters_of
 from tests.helpers.executed import run_cells
+from tests.helpers.recorded import record_drives
 
 
 def written(folder, parameters='run_dir = "."  # here', work="pass"):
@@ -177,10 +178,10 @@ TURNED = {
 
 
 @pytest.fixture(scope="module")
-def turned(demo_run, tmp_path_factory):
-    """A copy of the demo's run in which each parameter of notebooks 02 to 05 was turned; 02 has a kernel."""
-    folder = tmp_path_factory.mktemp("runs") / "copy"
-    shutil.copytree(demo_run, folder, ignore=shutil.ignore_patterns("episodes", "*.pth"))
+def turned(tiny_file, tmp_path_factory):
+    """A run of a tiny policy in which each parameter of notebooks 02 to 05 was turned; 02 has a kernel."""
+    folder = tmp_path_factory.mktemp("runs")
+    run_cells("01_load", folder, checkpoint=str(tiny_file), episodes=str(record_drives(folder / "episodes")))
     for name, (_, given) in TURNED.items():
         (runs.execute if name == "02_calibrate" else run_cells)(name, folder, **given)
     return folder
