@@ -1,6 +1,7 @@
 """What does a network like donkeycar's `linear` learn from the same recordings, on the same split, as `rover train`?
 
     python -m research.donkey_cnn cnn.json TUB...      # or EPISODES; a minute of processor each, half of it training
+    VARY='{"light": 0.25}' python -m research.donkey_cnn varied.json TUB...    # as rover_learn.augment varies pictures
 
 KerasLinear's layout: five convolutions, two dense layers, dropout, MSE, Adam, no augmentation, early stopping, and the
 picture alone. It looks at 80x60, for which its last two convolutions are padded; its linear outputs are steering now
@@ -8,6 +9,7 @@ and later. cnn.json has {name: {"r2": {"0": 0.6, "0.25": ..., "0.5": ..., "1": .
 """
 
 import json
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from rover_learn.augment import Augmentation, vary
 from rover_lib.onboard.params import params
 from rover_lib.workshop.recordings.blocks import usual_rate_hz
 from rover_lib.workshop.recordings.episodes import load_recordings, split
@@ -68,8 +71,18 @@ def predict(network: nn.Module, pictures: Tensor) -> Tensor:
     return torch.cat([network(part.float() / 255) for part in pictures.split(256)])
 
 
-def train(learning: Sequence[Tensor], choosing: Sequence[Tensor], seed: int) -> tuple[nn.Module, int]:
+def varied(pictures: Tensor, augmentation: Augmentation, rng: np.random.Generator) -> Tensor:
+    """Return pictures, (n, 3, 60, 80) uint8, varied, as float32 from 0 to 255."""
+    moved = torch.from_numpy(augmentation.shifted(pictures.permute(0, 2, 3, 1).contiguous().numpy(), rng))
+    drawn = augmentation.draw(len(moved), rng)
+    return vary(moved, {name: torch.from_numpy(values) for name, values in drawn.items()})
+
+
+def train(
+    learning: Sequence[Tensor], choosing: Sequence[Tensor], seed: int, augmentation: Augmentation
+) -> tuple[nn.Module, int]:
     """Return the network of the least error on the choosing part, and how many epochs it was trained."""
+    rng = np.random.default_rng(seed)
     torch.manual_seed(seed)
     network, (pictures, steering, mask) = linear(), learning
     optimizer = torch.optim.Adam(network.parameters(), RATE)
@@ -77,7 +90,7 @@ def train(learning: Sequence[Tensor], choosing: Sequence[Tensor], seed: int) -> 
     while idle < PATIENCE and epochs < EPOCHS:
         network.train()
         for rows in torch.randperm(len(pictures))[:EPOCH].split(BATCH):
-            errors = (network(pictures[rows].float() / 255) - steering[rows]) ** 2
+            errors = (network(varied(pictures[rows], augmentation, rng) / 255) - steering[rows]) ** 2
             optimizer.zero_grad()
             errors[mask[rows]].mean().backward()
             optimizer.step()
@@ -94,7 +107,7 @@ def r2(answers: Tensor, wanted: Tensor) -> float:
     return 1 - float(((answers - wanted) ** 2).mean() / wanted.var(correction=0))
 
 
-def judge(source: Path | str | Source) -> dict[str, Any]:
+def judge(source: Path | str | Source, augmentation: Augmentation) -> dict[str, Any]:
     """Train on recordings, and return R² of steering on the held-out part, by seconds ahead, and how it came about."""
     torch.set_num_threads(1)  # at this size, a second one mostly waits
     p = params()["calibration"]
@@ -102,7 +115,7 @@ def judge(source: Path | str | Source) -> dict[str, Any]:
     parts, rate_hz = split(recordings, p["held_out_share"], p["seed"]), usual_rate_hz(recordings.episodes)
     three = (parts.calibration, parts.choosing, parts.held_out)
     learning, choosing, held_out = (tensors(pick_evenly(part, MOST), rate_hz) for part in three)
-    network, epochs = train(learning, choosing, p["seed"])
+    network, epochs = train(learning, choosing, p["seed"], augmentation)
     answers, recorded, mask = predict(network, held_out[0]).double(), held_out[1].double(), held_out[2]
     shares = {}
     for i, ahead_s in enumerate(AHEAD_S):
@@ -119,10 +132,11 @@ def judge(source: Path | str | Source) -> dict[str, Any]:
 def main(out: str, *sources: str) -> None:
     """Judge one after the other, and write what is known after each."""
     path = Path(out)
+    augmentation = Augmentation(**json.loads(os.environ.get("VARY", "{}")))
     results = json.loads(path.read_text()) if path.exists() else {}
     for source in sources:
         name = Path(source).name
-        results[name] = judge(source)
+        results[name] = judge(source, augmentation)
         print(f"{name}: R² {results[name]['r2']}", flush=True)
         path.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
 

@@ -174,7 +174,18 @@ def write_stage(
     metrics: dict[str, Any],
     inputs: dict[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Write one stage's result atomically, and return it as it was written."""
+    """Write one stage's result atomically.
+
+    Args:
+        path: the JSON file.
+        stage: its name, which `read_stage` asks for.
+        params: what the result was made with.
+        metrics: the result; paths, arrays and dataclasses become plain values.
+        inputs: SHA-256 by the name of each file that it was made of.
+
+    Returns:
+        The content as it was written.
+    """
     parts = {"params": params, "metrics": metrics, "inputs": inputs or {}, "env": environment()}
     content = plain({"schema": SCHEMA, "stage": stage, **parts})
     with atomic_path(path) as temporary:

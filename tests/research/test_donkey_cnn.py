@@ -6,6 +6,7 @@ import torch
 
 from research import donkey_cnn
 from research.donkey_cnn import AHEAD_S, linear, predict, r2, tensors, train
+from rover_learn.augment import Augmentation
 from tests.helpers.policies import memory_samples
 
 RATE_HZ = 20.0
@@ -41,7 +42,7 @@ def test_it_learns_what_can_be_seen(monkeypatch):
     monkeypatch.setattr(donkey_cnn, "EPOCHS", 6)
     learning, choosing = tensors(samples(500, 0), RATE_HZ), tensors(samples(100, 1), RATE_HZ)
     assert choosing[2][0].tolist() == [True, True, True, True]  # a second ahead is step 20
-    network, epochs = train(learning, choosing, 0)
+    network, epochs = train(learning, choosing, 0, Augmentation(light=0.25))
     answers = predict(network, choosing[0])
     assert epochs == 6
     assert r2(answers[:, 0], choosing[1][:, 0]) > 0.5 > 0.2 > r2(answers[:, 3], choosing[1][:, 3])

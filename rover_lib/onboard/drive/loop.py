@@ -108,9 +108,23 @@ def drive(
 ) -> Report:
     """Arm the car, then send the pilot's order at each deadline until the drive ends.
 
-    link: None: no motor is driven. rate_hz: commands per second, within RATES_HZ. until: None: the drive ends when the
-    pilot has no more orders. report: filled during the drive. Raises RoverError if the drive cannot begin, and
-    DriveFault if a fault or the human stopped the car; neutral is sent before that.
+    Args:
+        pilot: gives the order of each tick.
+        link: to the Arduino; None: no motor is driven.
+        log: takes each tick and event.
+        rate_hz: commands per second, within RATES_HZ.
+        until: what ends the drive; None: the pilot has no more orders.
+        hooks: what else is called at each tick.
+        report: filled during the drive.
+        clock: in seconds.
+        sleep: for so many seconds.
+
+    Returns:
+        The report.
+
+    Raises:
+        RoverError: the drive cannot begin.
+        DriveFault: a fault or the human stopped the car; neutral is sent before that.
     """
     if not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
         raise ParamsError(f"a car is driven at {RATES_HZ[0]:g} to {RATES_HZ[1]:g} Hz", found=f"{rate_hz:g}")

@@ -66,10 +66,16 @@ class Policy:
     def predict_chunk(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray], state: np.ndarray) -> np.ndarray:
         """Predict the next actions for one observation.
 
-        frame_bgr: (h, w, 3) uint8 of any size, as OpenCV gives it; a mapping by camera name if there are several.
-        state: (S,) float, for the rover [steering, throttle] as last commanded.
-        Returns (chunk, A) float32; steering in [-1, 1], throttle in [0, 1] (from -1 if its car has reverse), other
-        actions as predicted. Raises as predict_unclipped().
+        Args:
+            frame_bgr: (h, w, 3) uint8 of any size, as OpenCV gives it; a mapping by camera name if there are several.
+            state: (S,) float, for the rover [steering, throttle] as last commanded.
+
+        Returns:
+            (chunk, A) float32; steering in [-1, 1], throttle in [0, 1] (from -1 if its car has reverse), other actions
+            as predicted.
+
+        Raises:
+            PolicyError: for frames and states that are none of this policy's, and a prediction that is not finite.
         """
         return np.clip(self.predict_unclipped(frame_bgr, state), self._low, self._high)
 
@@ -125,10 +131,17 @@ def import_engine(artifact: Artifact) -> Any:
 
 
 def load_policy(source: Path | str | Artifact, *, threads: int | None = None) -> Policy:
-    """Load an artifact, a file or an open one, and prove that it computes the same here as where it was made.
+    """Load an artifact, and prove that it computes the same here as where it was made.
 
-    threads: for the engine's kernels (with torch, of the whole process); None leaves their number unchanged. Raises
-    ArtifactError if checksums, manifest, engine or parity vectors (which also warm the kernels) fail, and for root.
+    Args:
+        source: a file, or an open artifact.
+        threads: for the engine's kernels (with torch, of the whole process); None leaves their number unchanged.
+
+    Returns:
+        The policy, whose parity vectors have also warmed the kernels.
+
+    Raises:
+        ArtifactError: if checksums, manifest, engine or parity vectors fail, and for root.
     """
     refuse_root()
     if not isinstance(source, Artifact):

@@ -13,8 +13,16 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 def prepare_frame(frame_bgr: np.ndarray, height: int, width: int) -> np.ndarray:
     """Resize and reorder one camera frame; the aspect ratio is not kept, as in the trainer.
 
-    frame_bgr: (h, w, 3) uint8 of any size, as OpenCV gives it. Returns (height, width, 3) uint8 RGB, contiguous, not
-    normalised: the artifact's graph does that. Raises PolicyError for anything that is not such a picture.
+    Args:
+        frame_bgr: (h, w, 3) uint8 of any size, as OpenCV gives it.
+        height: in pixels, the policy's.
+        width: likewise.
+
+    Returns:
+        (height, width, 3) uint8 RGB, contiguous, not normalised: the artifact's graph does that.
+
+    Raises:
+        PolicyError: for anything that is not such a picture.
     """
     if not isinstance(frame_bgr, np.ndarray) or frame_bgr.ndim != 3 or frame_bgr.shape[2] != 3:
         actual = getattr(frame_bgr, "shape", type(frame_bgr).__name__)

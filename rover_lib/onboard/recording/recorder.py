@@ -240,10 +240,23 @@ def record(
     label: str = "",
     clock: Callable[[], float] = time.monotonic,
 ) -> RecordReport:
-    """Record one episode of a human who drives, until `stop` is set or max_seconds are over.
+    """Record one episode of a human who drives.
 
-    At each tick of rate_hz, the Arduino's newest status is recorded as a control, none twice. If something else ends
-    the episode, it is in the report's `fault`. Raises EpisodeError if recording cannot begin.
+    Args:
+        camera: whose frames are recorded.
+        link: to the Arduino, whose newest status is recorded as a control at each tick, none twice.
+        folder: in which the episode's folder is made.
+        rate_hz: of the ticks.
+        max_seconds: after which it ends.
+        stop: ends it when it is set.
+        label: stored with the episode.
+        clock: in seconds, that of the camera's and the link's time stamps.
+
+    Returns:
+        What was recorded; `fault` is what ended it, if that is neither the time nor `stop`.
+
+    Raises:
+        EpisodeError: recording cannot begin.
     """
     stop = stop or threading.Event()
     lost = 0, 0

@@ -152,12 +152,20 @@ class Exporter:
         calibration: Calibration | None = None,
         drives: Drives | None = None,
     ) -> tuple[str, dict[str, Any]]:
-        """Write the artifact, for ONNX Runtime if the path ends in ONNX_SUFFIX.
+        """Write the artifact.
 
-        calibration: a quantized policy's, for the manifest. drives: by which it will tell how unfamiliar a picture is,
-        if they are enough for that. Returns its content hash, and what `familiar.fit` says of the drives, or {}. Raises
-        ArtifactError, and writes nothing, if the engine's form of the policy does not compute what the policy computes,
-        or gives anything that is not finite.
+        Args:
+            policy: in FP32, or quantized.
+            path: of the artifact, for ONNX Runtime if it ends in ONNX_SUFFIX.
+            calibration: a quantized policy's, for the manifest.
+            drives: by which it will tell how unfamiliar a picture is, if they are enough for that.
+
+        Returns:
+            Its content hash, and what `familiar.fit` says of the drives, or {}.
+
+        Raises:
+            ArtifactError: the engine's form of the policy does not compute what the policy computes, or gives anything
+                that is not finite; then nothing is written.
         """
         config = self.checkpoint.config
         module: nn.Module = policy.module if isinstance(policy, QuantizedPolicy) else policy

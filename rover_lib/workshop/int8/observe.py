@@ -154,7 +154,17 @@ def calibrate(
 ) -> Calibration:
     """Run the float policy over the samples, twice: for the channel scales, then for the observers behind them.
 
-    smooth: as in Scheme. Raises ArtifactError without samples, and for activations that are not finite.
+    Args:
+        checkpoint: the policy.
+        samples: pictures and states that it will meet on the road.
+        smooth: as in Scheme.
+        progress: shows which sample is observed.
+
+    Returns:
+        What a scheme needs to quantize the checkpoint, and no other one.
+
+    Raises:
+        ArtifactError: no samples, or activations that are not finite.
     """
     if not samples:
         raise ArtifactError("calibration needs samples", found="none", remedy="give other recordings")

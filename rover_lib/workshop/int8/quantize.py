@@ -52,7 +52,19 @@ class QuantizedPolicy:
 
 
 def quantize(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -> QuantizedPolicy:
-    """Quantize a checkpoint by a scheme. Raises ArtifactError when not everything that it names became INT8."""
+    """Quantize a checkpoint.
+
+    Args:
+        checkpoint: the policy.
+        scheme: what becomes INT8, and by which observers.
+        calibration: of this checkpoint.
+
+    Returns:
+        The policy in INT8, with a report.
+
+    Raises:
+        ArtifactError: not everything that the scheme names became INT8, or the calibration is another checkpoint's.
+    """
     start = time.monotonic()
     config = checkpoint.config
     static = scheme.mode != "dynamic"

@@ -181,8 +181,18 @@ def fidelity(
 ) -> Fidelity:
     """Run every policy on every sample.
 
-    samples: with frame_bgr(), state, chunk (C, A) and is_pad (C,). action_range: name -> (least, most).
-    Raises PolicyError for no samples, policies of other actions or chunks, or an action without a range.
+    Args:
+        reference: the policy in FP32.
+        others: by mode; of the same actions and chunk.
+        samples: with frame_bgr(), state, chunk (C, A) and is_pad (C,).
+        action_range: by name, (least, most).
+        progress: shows which sample is compared.
+
+    Returns:
+        The plans of each policy, beside what was recorded.
+
+    Raises:
+        PolicyError: no samples, policies of other actions or chunks, or an action without a range.
     """
     names = tuple(reference.action_names)
     if not samples:

@@ -26,11 +26,17 @@ COUNTED = "counted on an emulated Cortex-A76"
 def verdict(
     stages: Stages, params: Mapping[str, Any], names: Names, refusals: Mapping[str, Mapping[str, str]] | None = None
 ) -> dict[str, Any]:
-    """Return the verdict on a run, as run.json stores it.
+    """Judge a run.
 
-    stages: the metrics of the stages load, quantize, compare and benchmark, and of arm and students if they were made.
-    params: the content of params.yml. refusals: by mode, as `Expected.refusals`. "ready" in the result: whether the
-    policy drives; "deploy" is None if no artifact of it should drive this car.
+    Args:
+        stages: the metrics of load, quantize, compare and benchmark, and of arm and students if they were made.
+        params: the content of params.yml.
+        names: of the checkpoint, the recordings and the run, for commands to type.
+        refusals: by mode, as `Expected.refusals`.
+
+    Returns:
+        The verdict as run.json stores it. "ready": whether the policy drives. "deploy": the mode, or None if no
+        artifact of it should drive this car.
     """
     limits = params["verdict"]
     benchmark = stages["benchmark"]

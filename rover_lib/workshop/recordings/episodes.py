@@ -93,11 +93,19 @@ class _Frame:
 def load_recordings(
     root: Path | str | Source, chunk: int = 32, sync_s: float = 0.05, progress: Progress = silent
 ) -> Recordings:
-    """Read every episode folder below `root` (or `root` itself, if it is one), a LeRobotDataset, or donkeycar tubs.
+    """Read recordings. Faults are counted, and what they affect is repaired or skipped.
 
-    chunk: actions per sample. sync_s: largest distance in time between a frame and its control. Faults are counted, and
-    what they affect is repaired or skipped. Raises EpisodeError if nothing usable is left, with the most frequent
-    reasons.
+    Args:
+        root: a folder of episodes, or one of them; a LeRobotDataset; a donkeycar tub, or a folder of them.
+        chunk: actions per sample.
+        sync_s: largest distance in time between a frame and its control, in seconds.
+        progress: shows which episode is read.
+
+    Returns:
+        The episodes, their samples and faults, and what their states and actions are called.
+
+    Raises:
+        EpisodeError: nothing usable is left, with the most frequent reasons.
     """
     source = Source.of(root)
     root = source.path
@@ -303,11 +311,21 @@ def _make_samples(
 
 
 def split(recordings: Recordings, held_out_share: float = 0.25, seed: int = 0) -> Split:
-    """Split the samples by whole episodes, drawn at random with `seed`; half of the held-out share is for choosing.
+    """Split the samples by whole episodes, drawn at random.
 
     Long drives are split by their blocks instead, and fewer than three episodes along their time, with a gap of one
-    chunk between the parts; `note` says so. Raises EpisodeError for a share outside (0, 1), and for recordings too
-    short to be split.
+    chunk between the parts; `note` says so.
+
+    Args:
+        recordings: at least two chunks long.
+        held_out_share: of the episodes, in (0, 1); half of it is for choosing.
+        seed: of the draw.
+
+    Returns:
+        The samples to calibrate or learn with, those to choose with, and those to judge with.
+
+    Raises:
+        EpisodeError: for another share, and for recordings too short to be split.
     """
     if not 0 < held_out_share < 1:
         raise EpisodeError("held_out_share must be between 0 and 1", found=held_out_share)

@@ -95,16 +95,26 @@ def run(
     progress: Progress = silent,
     **overrides: Any,
 ) -> Path:
-    """Execute the five notebooks in order, and return the run's folder.
-
-    overrides: any of the notebooks' parameters, say worlds=40, samples=200, iterations=100.
+    """Execute the five notebooks in order.
 
     The new run is made in .<name>.new beside the old one of that name, and its files (`files_of_a_run`) replace the old
-    one's when it is complete; recordings, a checkpoint and benchmarks of other hosts stay.
+    one's when it is complete; recordings, a checkpoint and benchmarks of other hosts stay. After an error, Ctrl-C or
+    kill -9 the old run is as it was, and what the finished notebooks made waits in .<name>.new: the same call goes on.
 
-    Raises RoverError, in one sentence with the notebook, the cell and its error, or while another process makes a run
-    of that name; then, as after Ctrl-C or kill -9, the old run is as it was, and what the finished notebooks made waits
-    in .<name>.new: the same command continues. Raises ArtifactError for root, who may not load artifacts.
+    Args:
+        checkpoint: a trainer's file or a LeRobot folder.
+        episodes: recordings, a LeRobotDataset, or donkeycar tubs.
+        name: of the run's folder in runs_dir.
+        runs_dir: where runs are kept.
+        progress: shows which notebook is executed.
+        overrides: any of the notebooks' parameters, say worlds=40, samples=200, iterations=100.
+
+    Returns:
+        The run's folder.
+
+    Raises:
+        RoverError: in one sentence with the notebook, the cell and its error; or another process makes that run.
+        ArtifactError: root may not load artifacts.
     """
     refuse_root()
     folder = run_folder(runs_dir, name, RoverError)
@@ -139,10 +149,18 @@ def files_of_a_run(folder: Path) -> list[Path]:
 
 
 def execute(name: str, run_dir: Path | str, **overrides: Any) -> Path:
-    """Execute one notebook on an existing run, and return the path of the executed notebook in the run's folder.
+    """Execute one notebook on an existing run.
 
-    name: it, or its beginning, such as 04. Raises RoverError for an unknown notebook or parameter, or with the cell and
-    its error; an earlier executed one then stays.
+    Args:
+        name: of the notebook, or its beginning, such as 04.
+        run_dir: the run's folder.
+        overrides: of the notebook's parameters.
+
+    Returns:
+        The path of the executed notebook in the run's folder.
+
+    Raises:
+        RoverError: for an unknown notebook or parameter, or with the cell and its error; an earlier executed one stays.
     """
     matches = [notebook for notebook in NAMES + AFTERWARDS if notebook.startswith(name.removesuffix(".ipynb"))]
     if len(matches) != 1:
