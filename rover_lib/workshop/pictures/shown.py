@@ -28,12 +28,12 @@ ENCODED = 3  # a PNG's or a video's picture costs some times more than a JPEG's,
 SEEN = (96, 72)  # width and height to which pictures are scaled down
 EQUAL = 0.05  # grey levels between two pictures, on average; a real camera's noise alone is 0.2
 FROZEN = 10  # equal pictures in a row; a car that has just been started may stand for some
-REPEATED, OF_ONE = 0.2, 0.35  # the share of equal neighbours; of public tubs at most 0.13, and of one drive more
+REPEATED, OF_ONE = 0.2, 0.22  # the share of equal neighbours; of public tubs at most 0.13, of one drive 0.19
 MOVES = 0.01  # of throttle; a simulated car that stands sees equal pictures
 FLAT = 8.0  # grey levels between the darkest and the brightest part; of real pictures 37 and more
 BLANK = 0.05  # the share of a drive's pictures
 DARK, BRIGHT = 24.0, 231.0
-COVERED = 0.2  # the share of a picture that is always dark
+COVERED, DARK_PLACE = 0.2, 0.05  # the share of a picture that is always dark; beside drives with hardly any
 CLIPPED, DAZZLED = 250, 0.5  # a white pixel, and their share in half of the pictures
 COMPARED = 30  # samples of a drive; fewer show what the car stood before, or who carried it
 COLOURLESS, COLOURED = 0.5, 4.0  # grey levels between a picture's colours, on average
@@ -183,7 +183,8 @@ def _note_nothing(drive: _Drive, of_camera: str, faults: Faults) -> None:
 def _note_repeated(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> None:
     """Add a fault if all drives together, or one that was looked at often, have each picture several times."""
     rest = [drive for drive in drives if not drive.frozen]
-    alone = [drive for drive in rest if drive.compared >= LEAST_COMPARED and drive.equal >= OF_ONE * drive.compared]
+    often = [drive for drive in rest if drive.compared >= LEAST_COMPARED and not drive.shows_nothing]
+    alone = [drive for drive in often if drive.equal >= OF_ONE * drive.compared]
     compared, equal = sum(drive.compared for drive in rest), sum(drive.equal for drive in rest)
     all_of_them = compared >= LEAST_COMPARED and equal >= REPEATED * compared
     for repeated in [rest] if all_of_them else [[drive] for drive in alone]:
@@ -191,7 +192,7 @@ def _note_repeated(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> 
         note = f"{share:.0%} of the pictures{of_camera} equal the next one, though the car moves"
         files = round(share * sum(drive.episode.frames for drive in repeated))
         place = faults.root if all_of_them else repeated[0].episode.place
-        faults.add(place, "repeated_pictures", f"{note}: is the camera slower than the recording?", files)
+        faults.add(place, "repeated_pictures", f"{note}: is the camera slower, or does it stop now and then?", files)
 
 
 def _note_others(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> None:
@@ -207,7 +208,7 @@ def _note_others(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> No
     if len(long) < LEAST_DRIVES:
         return
     covered = np.array([min(piece.covered for piece in pieces) for pieces in long])
-    covered -= np.median(covered)  # a dark place is dark in all drives
+    covered *= (covered < DARK_PLACE).mean() >= 0.5  # else the place is dark
     for pieces, share in zip(long, covered.tolist(), strict=True):
         for drive in pieces if share > COVERED else ():
             note = f"{share:.0%} of each picture{of_camera} is black, and not of the other drives': leave it out"

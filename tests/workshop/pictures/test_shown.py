@@ -127,11 +127,18 @@ def test_steering_that_never_changes_is_named_and_a_held_throttle_is_not(factors
     assert any("steering is 0 throughout" in caution for caution in cautions) == named
 
 
-def test_a_camera_that_stops_now_and_then_is_named():
-    """For 6 pictures of 20, in all drives."""
+@pytest.mark.parametrize("odd", [[2], range(DRIVES)])
+def test_a_camera_that_stops_now_and_then_is_named(odd):
+    """For 6 pictures of 20, in one drive or in all."""
     k = np.arange(FRAMES)
-    (fault,) = recordings(lambda pictures: pictures[np.where(k % 20 < 6, k - k % 20, k)], range(DRIVES)).faults
-    assert fault.kind == "repeated_pictures"
+    (fault,) = recordings(lambda pictures: pictures[np.where(k % 20 < 6, k - k % 20, k)], odd).faults
+    assert fault.kind == "repeated_pictures" and fault.file == ("e2" if odd == [2] else ".")
+
+
+def test_a_dark_place_is_no_covered_lens():
+    """But one that is dark in half of the drives alone is."""
+    assert not recordings(part(slice(36), 4), range(DRIVES)).faults
+    assert {fault.kind for fault in recordings(part(slice(36), 4), (0, 1, 2)).faults} == {"covered_lens"}
 
 
 @pytest.mark.parametrize("times", [2, 3])
