@@ -95,9 +95,9 @@ def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
         by = ORIGIN if origin else GUESS
         if origin:
             facts.say("rate", float(origin.get("rate_hz", files.RATE_HZ)), ORIGIN)
-        modes = {step.where.name: step.modes["ACTION"] for step in (inner, outer) if "ACTION" in step.modes}
-        facts.compare("normalisation of actions", modes)
-        for name in inner.tensors.keys() & outer.tensors.keys():  # a training writes all into both files
+        steps = [step for step in (inner, outer) if step.tensors]
+        facts.compare("normalisation of actions", {step.where.name: step.modes.get("ACTION") for step in steps})
+        for name in sorted(inner.tensors.keys() & outer.tensors.keys()):  # a training writes all into both
             facts.compare(f"'{name}'", {step.where.name: step.tensors[name].tolist() for step in (inner, outer)})
         if (spread := outer.tensors.get("action.std")) is not None:
             facts.say("action std", spread.flatten().tolist(), OUTER[0])
@@ -246,8 +246,9 @@ def _act_config(folder: Path, raw: dict[str, Any], facts: Facts) -> SimpleNamesp
         settings.state = next((f for name, f in inputs.items() if (name, f.kind) == (STATE, "STATE")), None)
         action = settings.features.get(ACTION) if ACTION in settings.output_features else None
         settings.action = action if action and action.kind == "ACTION" else None
-        if settings.n_obs_steps != 1 or settings.n_action_steps > settings.chunk_size:
-            raise ValueError(f"n_obs_steps {settings.n_obs_steps}, n_action_steps {settings.n_action_steps}")
+        most = settings.chunk_size if settings.temporal_ensemble_coeff is None else 1
+        if settings.n_obs_steps != 1 or settings.n_action_steps > most:
+            raise ValueError(f"n_obs_steps {settings.n_obs_steps}, n_action_steps {settings.n_action_steps} of {most}")
         cameras = [camera.shape for camera in settings.images.values()]
         rows = [row.shape for row in (settings.state, settings.action) if row]
         whole = all(is_whole(n, 1, files.MOST) for n in chain(*cameras, *rows))
@@ -276,21 +277,23 @@ class Normaliser:
     def __init__(self, folder: Path, file: str, normalises: str, said: SimpleNamespace, inside: dict[str, Tensor]):
         """Raises CheckpointError for a step that is unknown."""
         self.where = folder / file
+        content = dict[str, Any]()
         steps = list[dict[str, Any]]()
         tensors = inside
         with files.as_checkpoint_error(self.where):
-            if not self.where.exists():
-                steps = [
-                    {"features": said.input_features | said.output_features, "norm_map": said.normalization_mapping}
-                ]
-            for step in _read_json(self.where)["steps"] if self.where.exists() else ():
+            if self.where.exists():
+                content = _read_json(self.where)
+                tensors = {}
+            else:
+                features = said.input_features | said.output_features
+                steps.append({"features": features, "norm_map": said.normalization_mapping})
+            for step in content["steps"] if content else ():
                 name = step.get("registry_name") or step["class"]
                 config = step.get("config") or {}
                 if config.get("enabled") is False:
                     continue  # as LeRobot writes steps that others of its policies use
                 if name == normalises:
                     steps.append(config)
-                    tensors = {}
                     if state_file := step.get("state_file"):
                         tensors = _read_safetensors(folder / Path(state_file).name)
                 elif name not in HARMLESS or config.get("rename_map"):
