@@ -14,6 +14,7 @@ VARIES = 1e-5  # standard deviation, of an action or of the state's mean; less i
 NEAR = 0.1  # of the actions' standard deviation: the mean distance of what is the same, but for noise and rounding
 NEARER = 1.5  # another lag is the right one if it leaves this much less
 ALIKE = 0.98  # correlation with the actions, in other units
+FOLLOWS_NONE = "follows no action"
 OTHER_STATE = "other_state"  # the kind of fault
 
 
@@ -28,8 +29,14 @@ def explain_state(states: np.ndarray, actions: np.ndarray, names: Sequence[str])
     """Say what an episode's states are, if they are not the action before; empty if they are. Both are (n, A)."""
     names_by_words: dict[str, list[str]] = {}
     if len(states) > LEAST_ROWS and np.isfinite(states).all() and np.isfinite(actions).all():
-        for name, state, action in zip(names, states.T.astype(float), actions.T.astype(float), strict=True):
-            if words := _explain(state, action):
+        states, actions = states.astype(float), actions.astype(float)
+        for i, name in enumerate(names):
+            words = _explain(states[:, i], actions[:, i])
+            for j, other in enumerate(names if words == FOLLOWS_NONE else ()):
+                follows = _explain(states[:, i], actions[:, j])
+                if follows != FOLLOWS_NONE:
+                    words = f"{follows or _called(1)}, of {other}"
+            if words:
                 names_by_words.setdefault(words, []).append(name)
     return ", ".join(f"{' and '.join(names_alike)}: {words}" for words, names_alike in names_by_words.items())
 
@@ -49,8 +56,10 @@ def _explain(state: np.ndarray, action: np.ndarray) -> str:
     alike = {lag: abs(np.corrcoef(a, b)[0, 1]) if b.std() > VARIES else 0.0 for lag, (a, b) in pairs.items()}
     best = max(LAGS, key=alike.__getitem__)
     if alike[best] < ALIKE:
-        return "follows no action"
+        return FOLLOWS_NONE
     gain, offset = np.polyfit(*pairs[best][::-1], 1)
+    if best == 1 and abs(gain - 1) < NEAR and abs(offset) < NEAR * state.std():
+        return ""  # but for noise
     return f"{gain:.3g} times {_called(best)}" + (f" plus {offset:.3g}" if abs(offset) > NEAR * state.std() else "")
 
 
@@ -64,4 +73,4 @@ def _called(lag: int) -> str:
         return "the last action"
     if lag == 0:
         return "the action of the same row"
-    return f"the action {abs(lag)} rows {'before' if lag > 0 else 'later'}"
+    return f"the action {abs(lag)} row{'s' * (abs(lag) > 1)} {'before' if lag > 0 else 'later'}"

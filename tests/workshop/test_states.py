@@ -30,11 +30,16 @@ NOISE = np.random.default_rng(0).normal(0, 0.01, (120, 2))
         (lambda a: before(a) * (1, 0) + (0, 0.3), "throttle: always 0.3"),
         (lambda a: a, "steering and throttle: the action of the same row"),
         (lambda a: before(a, 3), "steering and throttle: the action 3 rows before"),
-        (lambda a: np.roll(a, -1, 0), "the action 1 rows later"),
+        (lambda a: np.roll(a, -1, 0), "the action 1 row later"),
         (lambda a: before(a) * (30, 100), "steering: 30 times the last action, throttle: 100 times the last action"),
         (lambda a: before(a) * (450, 828) + (1456, 120), "450 times the last action plus 1.46e+03"),
         (lambda a: -a, "-1 times the action of the same row"),
-        (lambda a: before(a)[:, ::-1], "follows no action"),
+        (
+            lambda a: before(a)[:, ::-1],
+            "steering: the last action, of throttle, throttle: the last action, of steering",
+        ),
+        (lambda a: before(a) + NOISE * (1, 0.35), ""),
+        (lambda a: NOISE, "follows no action"),
     ],
 )
 def test_a_state_that_is_not_the_last_action_is_called_what_it_is(state, words):

@@ -21,7 +21,7 @@ from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.act_config import ACTIVATIONS, BACKBONES, ActConfig, Affine, check_shapes, imagenet
 from rover_lib.workshop.checkpoint.facts import GUESS, USER, Facts
-from rover_lib.workshop.checkpoint.files import CORRECT_IT, RATE_HZ, as_checkpoint_error, save_torch
+from rover_lib.workshop.checkpoint.files import COPY_AGAIN, CORRECT_IT, RATE_HZ, as_checkpoint_error, save_torch
 from rover_lib.workshop.checkpoint.lerobot import SIZE_OF_BASE, lerobot_folder, read_lerobot, write_lerobot
 from rover_lib.workshop.checkpoint.trainer import read_trainer, trainer_config
 from rover_lib.workshop.checkpoint.weights import Weights, tensor_bytes
@@ -96,9 +96,6 @@ class Checkpoint:
         if has != recorded:
             problem = f"{self.path}: a policy of cameras, states and actions {', '.join(map(str, has))}"
             raise CheckpointError(problem, found=f"recordings of {', '.join(map(str, recorded))}", remedy=TRAINED_ON)
-        for key, value in facts.unknown.items():
-            if self.format == "lerobot" and value is not None:
-                raise facts.refusal(key, value, "and nobody here knows what that does")
         guessed = [fact for fact in ("actions", "rate") if facts.source(fact) == GUESS]
         if guessed and not has_rate:  # our own recordings, which it was not trained on
             examples = {"actions": "actions=steering,throttle", "rate": "rate=30"}
@@ -121,11 +118,11 @@ class Checkpoint:
                 raise CheckpointError(f"{self.path}: the {problem} is {quote_all(own)}", found=actual, remedy=remedy)
         ordered = self._reordered(layout, samples, guessed)
         of_car = set(ordered.config.action_names) == set(ACTION_NAMES)
-        norm = ordered.config.action_unnorm
-        if of_car and norm and max(map(abs, norm.scale + norm.shift)) > FAR:
-            problem = f"{self.path}: the statistics of its actions are of other units than a rover's, from -1 to 1"
+        if of_car and (units := other_units(ordered.config)):
             remedy = "train on such actions; a throttle forward is from 0 to 1"
-            raise CheckpointError(problem, found=ordered.report["normalisation"]["action"], remedy=remedy)
+            raise CheckpointError(
+                f"{self.path}: {units}", found=ordered.report["normalisation"]["action"], remedy=remedy
+            )
         return ordered._at_trained_size(layout, samples)
 
     def _reordered(self, layout: Layout, samples: Sequence[Sample], guessed: Sequence[str]) -> "Checkpoint":
@@ -271,6 +268,11 @@ def load_checkpoint(path: Path | str, said: str = "") -> Checkpoint:
     config, weights, extra = read_lerobot(path, facts) if kind == "lerobot" else read_trainer(path, facts)
     check_limits(path, config)
     check_weights(path, config, weights, facts.unknown)
+    for key, value in facts.unknown.items():
+        if kind == "lerobot" and value is not None:
+            raise facts.refusal(key, value, "and nobody here knows what that does")
+    if units := other_units(config):
+        facts.notes.append(f"{units}: if it is a car's, rover run refuses it")
     if facts.unknown:
         facts.notes.append(f"nobody here knows what these keys mean, not used: {quote_all(facts.unknown)}")
     acts = sum(weight.numel() for name, weight in weights.items() if not name.startswith("vae_"))
@@ -285,6 +287,14 @@ def load_checkpoint(path: Path | str, said: str = "") -> Checkpoint:
         **extra,
     }
     return Checkpoint(path, kind, config, weights, sha256_of(file), report, facts)
+
+
+def other_units(c: ActConfig) -> str:
+    """Say that two actions' statistics are of other units than a car's, or ""."""
+    norm = c.action_unnorm
+    if len(c.action_names) != len(ACTION_NAMES) or norm is None or max(map(abs, norm.scale + norm.shift)) <= FAR:
+        return ""
+    return "the statistics of its actions are of other units than a rover's, from -1 to 1"
 
 
 def normalisation(c: ActConfig) -> dict[str, str]:
@@ -351,8 +361,11 @@ def check_weights(path: Path, c: ActConfig, weights: dict[str, Tensor], unknown:
     with as_checkpoint_error(path, CORRECT_IT + forked):
         check_shapes(c, weights)
     if bad := [k for k, v in weights.items() if not torch.isfinite(v.float()).all()]:
-        problem = f"{path}: NaN or Inf in {quote_all(bad)}"
-        raise CheckpointError(problem, remedy="training diverged, take an earlier checkpoint")
+        problem = f"{path}: NaN or Inf in {len(bad)} of {len(weights)} weights: {quote_all(bad)}"
+        remedy = "training diverged, take an earlier checkpoint"
+        if 2 * len(bad) < len(weights):  # a step with a loss of NaN makes all of them NaN
+            remedy = f"is the file damaged? {COPY_AGAIN}; or {remedy}"
+        raise CheckpointError(problem, remedy=remedy)
 
 
 def write_both(

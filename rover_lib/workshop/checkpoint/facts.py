@@ -27,6 +27,7 @@ USER, GUESS = "--facts", "a guess"
 WORDS = yaml.safe_load(Path(__file__).with_name("keys.yml").read_text())
 NETWORK = 10_000  # floats; more may be all weights of a network
 SMALL = 64  # numbers or keys; more are weights
+DRIVES = "which may be the weights that should drive"
 # Values that change nothing, unlike True.
 NOTHING: tuple[Any, ...] = (None, False, 0, 1, "", "none", "identity", "rgb", "relu", "sine", "jpg", "png", [], (), {})
 
@@ -186,7 +187,7 @@ class _Key:
         if self.of_network or (
             isinstance(self.value, Mapping) and any(isinstance(v, Tensor) for v in self.value.values())
         ):
-            return "which may be the weights that should drive"
+            return DRIVES
         relevant = self.has("image") or self.has("numbers") or (self.several and self.last & {"camera", "cameras"})
         if relevant and not self.is_label and self.value not in (2, 3, chunk):  # counts that it has
             return "and nobody here knows what that does to its numbers or pictures"
@@ -196,6 +197,16 @@ class _Key:
 def words_of(key: str) -> set[str]:
     """Return the words of a key's name: those of `actionMean` are action and mean."""
     return set(re.findall("[a-z]+[0-9]*", re.sub("([a-z])([A-Z])", r"\1_\2", key).lower()))
+
+
+def meaning_of(name: str) -> str:
+    """Say what a file beside the weights, or a weight that no ACT has, may mean by its name; "" if unknown."""
+    words = words_of(name)
+    if not words.isdisjoint(WORDS["averaged"]):
+        return DRIVES
+    if not words.isdisjoint(WORDS["statistics"]) or len(words & {*WORDS["ends"]}) > 1:
+        return "which may mean how its numbers are normalised"
+    return ""
 
 
 def count_floats(value: Any) -> int:

@@ -13,7 +13,7 @@ from rover_lib.onboard.errors import CheckpointError, printable
 from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.onboard.stage import atomic_path, read_plain
 from rover_lib.workshop.act_config import ActConfig
-from rover_lib.workshop.checkpoint.facts import Facts
+from rover_lib.workshop.checkpoint.facts import DRIVES, Facts, meaning_of
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
 
 # Config, weights by LeRobot's names without the leading `model.`, and more for the report.
@@ -23,14 +23,11 @@ COPY_AGAIN = "copy it again, the whole folder if it is one"
 CORRECT_IT = "correct the config to what the policy was trained with"
 RATE_HZ = 30.0  # steps of a plan in a second if nothing says it: the rate of the trainer's recordings
 JSON_BYTES = 1_000_000  # settings take some kB
-# Files beside a checkpoint that may say how it was trained: those that are read, and those that are not.
+# Files beside a checkpoint that may say how it was trained: those that are read.
 BESIDE = re.compile(r"([^.].*_)?(config|cfg|hparams|args|hyperparameters|settings|metadata)\.(json|ya?ml)", re.I)
-STATISTICS = re.compile(
-    r"([^.].*_)?(stats|statistics|mean_std|norm|normali[sz]er|normali[sz]ation|scaler)"
-    r"\.(pth?|json|ya?ml|pkl|joblib|np[yz]|safetensors)",
-    re.I,
-)
-AVERAGED = re.compile(r"([^.].*[_.-])?(ema|swa|averaged?|shadow|polyak)([_.-].*)?\.(safetensors|pth?|ckpt|bin)", re.I)
+NUMBERS = re.compile(
+    r"\.(safetensors|pth?|ckpt|bin|json|ya?ml|pkl|joblib|np[yz]|csv|txt)", re.I
+)  # files that hold some
 
 
 def name_numbers(count: int, stem: str) -> tuple[str, ...]:
@@ -56,14 +53,12 @@ def check_beside(folder: Path, facts: Facts) -> list[Path]:
     """Return a folder's files. Raises CheckpointError for one whose name says statistics or averaged weights."""
     files = sorted(folder.iterdir())
     named = b"".join(read_plain(path, JSON_BYTES) for path in folder.glob("policy_p*processor.json"))  # LeRobot's own
-    for pattern, meaning in (
-        (STATISTICS, "which may mean how its numbers are normalised"),
-        (AVERAGED, "which may be the weights that should drive"),
-    ):
-        for file in files:
-            ours = file.name in facts.ignored or file.name.encode() in named
-            if pattern.fullmatch(file.name) and not ours:
-                raise facts.refusal(file.name, "beside it", meaning)
+    for file in (*files, *sorted(folder.glob("assets/*/*"))):  # where openpi has them
+        meaning = meaning_of(file.stem)
+        holds = NUMBERS.fullmatch(file.suffix) or (file.is_dir() and meaning == DRIVES)
+        own = file == facts.path or file.name.encode() in named or file.name in facts.ignored
+        if meaning and holds and not own and not file.name.startswith((".", "policy_pre", "policy_post")):
+            raise facts.refusal(file.name, "beside it", meaning)
     return files
 
 

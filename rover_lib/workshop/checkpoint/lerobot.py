@@ -1,16 +1,17 @@
 """Read the folder that `lerobot-train` leaves: config.json, model.safetensors, and how each feature is normalised.
 
-LeRobot's own classes read the config and the processors. What they accept without a word, such as a feature that has no
-statistics and so is left as it is, is checked here.
+The config and the processors are read as LeRobot's classes do. What those accept without a word, such as a feature that
+has no statistics and so is left as it is, is checked here.
 """
 
 import json
 import re
-from collections.abc import Mapping
-from dataclasses import astuple, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import torch
 from safetensors import SafetensorError
@@ -23,12 +24,9 @@ from rover_lib.workshop.act_config import LEROBOTS, ActConfig, Affine, lerobot_a
 from rover_lib.workshop.checkpoint import files
 from rover_lib.workshop.checkpoint.facts import GUESS, USER, WORDS, Facts
 from rover_lib.workshop.checkpoint.weights import Weights, check_weights_are_whole, name_weights
-from rover_lib.workshop.recordings.names import CAMERA, camera_names
+from rover_lib.workshop.recordings.names import ACTION, CAMERA, STATE, camera_names
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
 from rover_lib.workshop.untrusted import quote, quote_all, read_json
-
-if TYPE_CHECKING:
-    from lerobot.policies.act.configuration_act import ACTConfig
 
 PRETRAINED = "pretrained_model"
 CONFIG = "config.json"
@@ -39,6 +37,14 @@ IN_WEIGHTS = r"^(un)?normalize_(inputs|outputs|targets)\.buffer_{key}\.\w+$"
 Sizes = tuple[tuple[int, int], ...]
 VARIES = 1e-5  # standard deviation, or half of a range; less is rounding
 APART = 2.0  # deviations, or as many times as large: statistics of other numbers than the actions
+KINDS = ("STATE", "VISUAL", "ENV", "ACTION", "REWARD", "LANGUAGE")  # of features
+MODES = {  # of normalisation, and the statistics that each uses
+    "MEAN_STD": ("mean", "std"),
+    "MIN_MAX": ("min", "max"),
+    "QUANTILES": ("q01", "q99"),
+    "QUANTILE10": ("q10", "q90"),
+    "IDENTITY": (),
+}
 EPS = 1e-8  # what LeRobot's normaliser adds to a standard deviation
 SAME = {"type", "chunk_size", "input_features", "output_features", "normalization_mapping", "vision_backbone"}
 NOT_OF_POLICY = {"policy", "optimizer", "scheduler", "eval", "wandb", "env"}  # sections of train_config.json
@@ -74,26 +80,26 @@ def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
     tensors = name_weights(folder, _read_safetensors(folder / WEIGHTS), facts.ignored)
     inside: dict[str, Tensor] = {}
     if not (folder / OUTER[0]).exists():  # of before LeRobot had processors
-        for key in (*settings.input_features, *settings.output_features):
+        for key in settings.features:
             for name in [n for n in tensors if re.search(IN_WEIGHTS.format(key=key.replace(".", "_")), n)]:
                 inside[f"{key}.{name.rpartition('.')[2]}"] = tensors.pop(name)
-    weights = check_weights_are_whole(folder, tensors)
+    weights = check_weights_are_whole(facts, tensors)
     inner = Normaliser(folder, *INNER, settings, inside)
     outer = Normaliser(folder, *OUTER, settings, inside)
     origin = _read_json(folder / ORIGIN) if (folder / ORIGIN).exists() else {}  # what we noted in one that we wrote
-    images = settings.image_features
-    numbers = settings.robot_state_feature
-    actions = settings.action_feature
+    images = settings.images
+    numbers = settings.state
+    actions = settings.action
     with files.as_checkpoint_error(folder):
         sizes = _trained_sizes(folder, raw, tuple((f.shape[1], f.shape[2]) for f in images.values()), facts)
         by = ORIGIN if origin else GUESS
         if origin:
             facts.say("rate", float(origin.get("rate_hz", files.RATE_HZ)), ORIGIN)
-        in_both = any(name.startswith("action.") for name in inner.step.state_dict())  # as in training
-        steps = {INNER[0]: inner, OUTER[0]: outer} if in_both else {}
-        norms = {file: step.affine("action", "ACTION", actions.shape, inverse=True) for file, step in steps.items()}
-        facts.compare("normalisation of actions", {file: norm and astuple(norm) for file, norm in norms.items()})
-        if (spread := outer.step.state_dict().get("action.std")) is not None:
+        steps = [step for step in (inner, outer) if step.tensors]
+        facts.compare("normalisation of actions", {step.where.name: step.modes.get("ACTION") for step in steps})
+        for name in sorted(inner.tensors.keys() & outer.tensors.keys()):  # a training writes all into both
+            facts.compare(f"'{name}'", {step.where.name: step.tensors[name].tolist() for step in (inner, outer)})
+        if (spread := outer.tensors.get("action.std")) is not None:
             facts.say("action std", spread.flatten().tolist(), OUTER[0])
         pictures = tuple(inner.affine(k, "VISUAL", (3, 1, 1)) or Affine((1.0,) * 3, (0.0,) * 3) for k in images)
         config = ActConfig(
@@ -109,7 +115,7 @@ def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
             image_norm=pictures,
             state_norm=inner.affine("observation.state", "STATE", numbers.shape) if numbers else None,
             sees_state=numbers is not None,
-            action_unnorm=norms.get(OUTER[0]) or outer.affine("action", "ACTION", actions.shape, inverse=True),
+            action_unnorm=outer.affine("action", "ACTION", actions.shape, inverse=True),
             **{ours: getattr(settings, theirs) for ours, theirs in LEROBOTS.items()},
         )
         config, weights = _without_constants(config, weights, inner, facts)
@@ -210,35 +216,54 @@ def _trained_sizes(folder: Path, raw: Mapping[str, Any], sizes: Sizes, facts: Fa
     return (facts.value("size"),) if len(sizes) == 1 and facts.source("size") == USER else sizes
 
 
-def _act_config(folder: Path, raw: dict[str, Any], facts: Facts) -> "ACTConfig":
-    """Return the config as LeRobot reads it; a note says what it asks for beyond the network."""
+class _Feature(NamedTuple):
+    kind: str  # one of KINDS
+    shape: tuple[int, ...]
+
+
+def _features(content: Mapping[str, Any]) -> dict[str, _Feature]:
+    """Read features by their names. Raises errors of many kinds."""
+    features = {name: _Feature(str(each["type"]), tuple(each["shape"])) for name, each in content.items()}
+    if unknown := {feature.kind for feature in features.values()} - {*KINDS}:
+        raise ValueError(f"{quote_all(unknown)} is no type of a feature")
+    return features
+
+
+def _act_config(folder: Path, raw: dict[str, Any], facts: Facts) -> SimpleNamespace:
+    """Return the config as LeRobot reads it, and its features by their kinds; its own reader takes seconds to import.
+
+    A note says what it asks for beyond the network.
+    """
     path = folder / CONFIG
     if raw.get("type") != "act":
         problem = f"{path}: policy type is {quote(raw.get('type'))}"
         raise CheckpointError(problem, remedy='only \'act\' is known: if it is one, write "type": "act" into it')
     with files.as_checkpoint_error(path, files.CORRECT_IT):
-        import draccus  # LeRobot's reader of configs
-        from lerobot.policies.act.configuration_act import ACTConfig
-
-        options = {field.name for field in fields(ACTConfig)}
-        # LeRobot 0.4 refuses what 0.6 added, and whether the training had CUDA is nothing to us.
-        decoded = draccus.decode(ACTConfig, {k: v for k, v in raw.items() if k in options} | {"device": "cpu"})
-        cameras = [tuple(camera.shape) for camera in decoded.image_features.values()]
-        rows = [tuple(row.shape) for row in (decoded.robot_state_feature, decoded.action_feature) if row]
+        settings = SimpleNamespace(**WORDS["act"] | {key: raw[key] for key in WORDS["act"] if key in raw})
+        settings.features = _features(settings.input_features) | _features(settings.output_features)
+        inputs = {name: settings.features[name] for name in settings.input_features}
+        settings.images = {name: feature for name, feature in inputs.items() if feature.kind == "VISUAL"}
+        settings.state = next((f for name, f in inputs.items() if (name, f.kind) == (STATE, "STATE")), None)
+        action = settings.features.get(ACTION) if ACTION in settings.output_features else None
+        settings.action = action if action and action.kind == "ACTION" else None
+        most = settings.chunk_size if settings.temporal_ensemble_coeff is None else 1
+        if settings.n_obs_steps != 1 or settings.n_action_steps > most:
+            raise ValueError(f"n_obs_steps {settings.n_obs_steps}, n_action_steps {settings.n_action_steps} of {most}")
+        cameras = [camera.shape for camera in settings.images.values()]
+        rows = [row.shape for row in (settings.state, settings.action) if row]
         whole = all(is_whole(n, 1, files.MOST) for n in chain(*cameras, *rows))
         right = all(len(s) == 3 and s[0] == 3 for s in cameras) and all(len(s) == 1 for s in rows)
-    if not (cameras and decoded.action_feature and whole and right) or decoded.env_state_feature:
-        features = {**decoded.input_features, **decoded.output_features}
-        actual = quote_all(f"{name} {feature.type.value} {feature.shape}" for name, feature in features.items())
+    if not (cameras and settings.action and whole and right) or "ENV" in {f.kind for f in inputs.values()}:
+        actual = quote_all(f"{name} {feature.kind} {feature.shape}" for name, feature in settings.features.items())
         remedy = "train with cameras (3, height, width), numbers in 'action', and in 'observation.state' or none"
         raise CheckpointError(f"{folder}: its features are not a car's", found=actual, remedy=remedy)
-    if decoded.temporal_ensemble_coeff is not None:
-        coefficient = f"temporal_ensemble_coeff is {decoded.temporal_ensemble_coeff}"
+    if settings.temporal_ensemble_coeff is not None:
+        coefficient = f"temporal_ensemble_coeff is {settings.temporal_ensemble_coeff}"
         facts.notes.append(f"{coefficient}: LeRobot would average plans; here the car drives by the newest alone")
     facts.default("size", cameras[0][1:], SIZE_OF_BASE)
     with files.as_checkpoint_error(path):
-        facts.read({k: v for k, v in raw.items() if k not in {*options, "type", "pretrained_revision"}}, "")
-    return decoded
+        facts.read({k: v for k, v in raw.items() if k not in {*WORDS["act"], *WORDS["of_lerobot"]}}, "")
+    return settings
 
 
 class Normaliser:
@@ -249,39 +274,47 @@ class Normaliser:
     inside: statistics that lie among the weights, as LeRobot's step names them.
     """
 
-    def __init__(self, folder: Path, file: str, normalises: str, said: "ACTConfig", inside: dict[str, Tensor]):
+    def __init__(self, folder: Path, file: str, normalises: str, said: SimpleNamespace, inside: dict[str, Tensor]):
         """Raises CheckpointError for a step that is unknown."""
-        from lerobot.processor.normalize_processor import NormalizerProcessorStep
-
         self.where = folder / file
-        if not self.where.exists():
-            features = {**said.input_features, **said.output_features}
-            self.step = NormalizerProcessorStep(features, said.normalization_mapping)
-            self.step.load_state_dict(inside)
-            return
-        content = _read_json(self.where)
-        read = []
+        content = dict[str, Any]()
+        steps = list[dict[str, Any]]()
+        tensors = inside
         with files.as_checkpoint_error(self.where):
-            for step in content["steps"]:
+            if self.where.exists():
+                content = _read_json(self.where)
+                tensors = {}
+            else:
+                features = said.input_features | said.output_features
+                steps.append({"features": features, "norm_map": said.normalization_mapping})
+            for step in content["steps"] if content else ():
                 name = step.get("registry_name") or step["class"]
                 config = step.get("config") or {}
                 if config.get("enabled") is False:
                     continue  # as LeRobot writes steps that others of its policies use
                 if name == normalises:
-                    read.append(NormalizerProcessorStep(**config))
-                    if file := step.get("state_file"):
-                        read[-1].load_state_dict(_read_safetensors(folder / Path(file).name))
+                    steps.append(config)
+                    if state_file := step.get("state_file"):
+                        tensors = _read_safetensors(folder / Path(state_file).name)
                 elif name not in HARMLESS or config.get("rename_map"):
                     problem = f"{self.where}: has a processor step that is not known here: {quote(name)}"
                     raise CheckpointError(problem, remedy="train without it, or do in the recordings what it does")
-        if len(read) != 1 or read[0].normalize_observation_keys is not None:
-            problem = f"{self.where}: normalises {len(read)} times, or some of the observations only"
+        if len(steps) != 1 or steps[0].get("normalize_observation_keys") is not None:
+            problem = f"{self.where}: normalises {len(steps)} times, or some of the observations only"
             raise CheckpointError(problem, remedy="copy the folder again, or train with LeRobot's own single step")
-        self.step = read[0]
+        with files.as_checkpoint_error(self.where):
+            if unknown := steps[0].keys() - {"features", "norm_map", "eps", "normalize_observation_keys"}:
+                raise ValueError(f"{quote_all(unknown)} is not known here")
+            self.features = _features(steps[0]["features"])
+            self.modes = dict(steps[0]["norm_map"])
+            if unknown := {*self.modes.values()} - MODES.keys():
+                raise ValueError(f"{quote_all(unknown)} is no way to normalise")
+            self.eps = float(steps[0].get("eps", EPS))
+            self.tensors = {name: tensor.float() for name, tensor in tensors.items()}
 
     def statistics(self, key: str) -> list[tuple[float, float]]:
         """Return the mean and the deviation of each number of a feature; [] if they are not there."""
-        stats = self.step.state_dict()
+        stats = self.tensors
         parts = [stats[name].flatten().tolist() for part in ("mean", "std") if (name := f"{key}.{part}") in stats]
         return list(zip(*parts, strict=True)) if len(parts) == 2 else []
 
@@ -291,7 +324,7 @@ class Normaliser:
         Raises CheckpointError for those that varied, and whose quantiles were equal.
         """
         fixed = [i for i, (a, b) in enumerate(zip(norm.scale, norm.shift, strict=True)) if VARIES * max(a, abs(b)) >= 1]
-        mode = self.step.norm_map[self.step.features[key].type].value
+        mode = self.modes[self.features[key].kind]
         varied = [i for i in fixed if (pairs := self.statistics(key)) and pairs[i][1] > VARIES]
         if varied and mode.startswith("QUANTILE"):
             problem = f"{self.where}: most values of '{key}' were equal: {mode} gives no range for the others"
@@ -304,20 +337,19 @@ class Normaliser:
         key, kind, shape: the feature's. inverse: undo the normalisation, as for an output. Raises CheckpointError for
         missing or wrong statistics.
         """
-        step = self.step
-        own = self.step.features.get(key)
+        own = self.features.get(key)
         if own and not inverse:
-            kind = own.type.value  # by which LeRobot chooses the mode, whatever the config says
-        mode = {k.value: m.value for k, m in step.norm_map.items()}.get(kind)
+            kind = own.kind  # by which LeRobot chooses the mode, whatever the config says
+        mode = self.modes.get(kind)
         if mode == "IDENTITY":
             return None
-        stats = [name for name in step.state_dict() if name.startswith(f"{key}.")]
+        stats = [name for name in self.tensors if name.startswith(f"{key}.")]
         if mode is None or not stats or not (inverse or (own and kind != "ACTION")):
             actual = f"mode {quote(mode)}, statistics {quote_all(stats) or 'none'}"
             remedy = "copy all policy_preprocessor* and policy_postprocessor* files, or say IDENTITY for raw values"
             raise CheckpointError(f"{self.where}: '{key}' would not be normalised", found=actual, remedy=remedy)
         x = torch.stack([torch.zeros(shape), torch.ones(shape)]).double()
-        y = step._normalize_action(x, True) if inverse else step._normalize_observation({key: x}, False)[key]
+        y = self._normalised(x, mode, [self.tensors[f"{key}.{part}"].double() for part in MODES[mode]], inverse)
         shift = y[0].flatten()
         scale = (y[1] - y[0]).flatten()
         finite = torch.isfinite(scale.float()).all() and torch.isfinite(shift.float()).all()  # used as float32
@@ -333,6 +365,15 @@ class Normaliser:
             scale, shift = scale.minimum(largest), torch.where(scale > largest, end - usual * largest, shift)
         return Affine(tuple(scale.tolist()), tuple(shift.tolist()))
 
+    def _normalised(self, x: Tensor, mode: str, ends: Sequence[Tensor], inverse: bool) -> Tensor:
+        """Return what LeRobot's step makes of x, in the same order of operations."""
+        if mode == "MEAN_STD":
+            mean, std = ends
+            return x * std + mean if inverse else (x - mean) / (std + self.eps)
+        low, high = ends
+        width = torch.where(high == low, self.eps, high - low)
+        return (x + 1) / 2 * width + low if inverse else 2 * (x - low) / width - 1
+
 
 def _read_json(path: Path) -> dict[str, Any]:
     with files.as_checkpoint_error(path):
@@ -341,7 +382,8 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
-        problem = f"{printable(str(path))}: not found, or not a file"
+        parts = quote_all(sorted(part.name for part in path.parent.glob(f"{path.stem}*"))) or "none"
+        problem = f"{printable(str(path))}: not found, or not a file, found {parts}"
         raise CheckpointError(problem, remedy="merge an adapter or pieces where it was trained, and save_pretrained")
     with files.as_checkpoint_error(path):
         return load_file(path)

@@ -26,6 +26,7 @@ from rover_lib.workshop.checkpoint.weights import (
     name_weights,
     tensor_bytes,
 )
+from rover_lib.workshop.recordings.strangers import name_stranger
 from rover_lib.workshop.untrusted import quote, quote_all
 
 TRAINER_CAMERA, OF_TRAINER = "cam_front", "the trainer's format"
@@ -45,7 +46,7 @@ def read_trainer(path: Path, facts: Facts) -> files.Contents:
             remedy = "is it the trainer's, or only weights? those of the first ACT, ALOHA's, are of another network"
             raise CheckpointError(f"{path}: no '{key}' in it", found=actual, remedy=remedy)
     raw = {k: v.item() if isinstance(v, np.generic) else v for k, v in content["config"].items()}
-    weights = check_weights_are_whole(path, name_weights(path, content["model_state_dict"], facts.ignored))
+    weights = check_weights_are_whole(facts, name_weights(path, content["model_state_dict"], facts.ignored))
     loss = content.get("best_val_loss")  # NaN if the training had diverged
     with files.as_checkpoint_error(path, "save best_val_loss as a number, or leave it out"):
         loss = None if loss is None else float(loss)
@@ -118,13 +119,14 @@ NUMPY: list[Any] = [(SCALAR, f"numpy.{core}.multiarray.scalar") for core in ("co
 NUMPY += [np.dtype, *(type(np.dtype(t)) for t in (np.float64, np.float32, np.int64, np.int32))]
 SAVE_AGAIN = """python -c "import torch; f = {path!r}; torch.save(torch.load(f, weights_only=False), f)\""""
 UNPACK = "unpack it, or give the file that the training saved"
-UNKNOWN = f"docs/data.md names those read here; or is it damaged? {files.COPY_AGAIN}"
+UNKNOWN = "an unknown kind of file"
+IN_DOCS = f"docs/data.md names those read here; or is it damaged? {files.COPY_AGAIN}"
 OTHERS = (  # how other files begin, what they are, and what to do
     (rb"$", "an empty file", files.COPY_AGAIN),
     (rb"\s*<", "a web page", "download the file itself"),
     (rb"\s*\{|.{6}\0\0\{", "JSON or safetensors", "give the whole folder, with config.json and model.safetensors"),
     (rb"\x1f\x8b|BZh|7z|Rar|.{257}ustar", "an archive", UNPACK),
-    (rb"[^P\x80]", "an unknown kind of file", UNKNOWN),
+    (rb"[^P\x80]", UNKNOWN, IN_DOCS),
 )
 
 
@@ -133,6 +135,8 @@ def _read_pickle(path: Path) -> Any:
     head = read_head(path)
     for begins, kind, remedy in OTHERS:
         if re.match(begins, head, re.S):
+            if kind == UNKNOWN:
+                kind, remedy = name_stranger(path) or (kind, remedy)
             raise CheckpointError(f"{path}: {kind}, not a checkpoint of a training", remedy=remedy)
     try:
         with zipfile.ZipFile(path) as z:

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from rover_lib.onboard.errors import CheckpointError
-from rover_lib.workshop.checkpoint.facts import USER
+from rover_lib.workshop.checkpoint.facts import USER, Facts, meaning_of
 from rover_lib.workshop.checkpoint.files import COPY_AGAIN
 from rover_lib.workshop.untrusted import quote_all
 
 Weights = dict[str, Tensor]
-IS_IT_WHOLE = "is it an ACTPolicy of LeRobot, and whole? If its weights hold statistics, remove policy_p*processor.json"
+IS_IT_WHOLE = "is it an ACTPolicy of LeRobot, and whole?"
 # Parts of names that torch.compile, DataParallel, FSDP and checkpointing put anywhere, which change nothing.
 WRAPPERS = r"(?<![^.])(module|_orig_mod|_(fsdp|checkpoint)_wrapped_module)\."
 COUNTS = r"(.*\.)?(num_batches_tracked|n_averaged)"  # a batch norm's, and AveragedModel's; LeRobot's norms are frozen
@@ -61,12 +61,24 @@ def _is_same(a: Any, b: Any) -> bool:
     return a is b or (isinstance(a, Tensor) and isinstance(b, Tensor) and torch.equal(a, b))
 
 
-def check_weights_are_whole(path: Path, weights: Mapping[str, Any]) -> Weights:
-    """Return a network's weights without `model.`.
+def check_weights_are_whole(facts: Facts, weights: Mapping[str, Any]) -> Weights:
+    """Return a network's weights without `model.`, and without what the user ignores.
 
     Raises CheckpointError for other names, what is no dense tensor of floats with values, and for matrices with a long
     row of zeros, as in files that were not copied to their end.
     """
+    path = facts.path
+    outside = dict[str, str]()  # and what stands before their names, by which they can be ignored
+    for name in weights:
+        begins = name.split("." if "." in name else "_")[0]
+        if not re.fullmatch(rf"model\..*|{COUNTS}", name) and begins not in facts.ignored:
+            outside[name] = begins
+    if outside:
+        first = next(filter(meaning_of, outside), next(iter(outside)))
+        meaning = meaning_of(first) or "and nobody here knows what that does"
+        value = f"one of {len(outside)} that LeRobot's ACT does not have"
+        raise facts.refusal(first, value, meaning, ",".join(sorted({*outside.values()})))
+    weights = {name: weights[name] for name in weights if re.fullmatch(r"model\..*", name)}
     weights = {name: weight for name, weight in weights.items() if not re.fullmatch(COUNTS, name)}
     odd, torn = [], []
     for name, weight in weights.items():
@@ -78,8 +90,6 @@ def check_weights_are_whole(path: Path, weights: Mapping[str, Any]) -> Weights:
     if odd:
         problem = f"{path}: these weights are not dense tensors of floats: {quote_all(odd)}"
         raise CheckpointError(problem, remedy="save policy.state_dict() as it was trained")
-    if outside := [name for name in weights if not name.startswith("model.")]:
-        raise CheckpointError(f"{path}: names outside 'model.': {quote_all(outside)}", remedy=IS_IT_WHOLE)
     if torn:
         problem = f"{path}: damaged, its weights are zeros where a training leaves none: {quote_all(torn)}"
         raise CheckpointError(problem, remedy=f"was it copied to its end? {COPY_AGAIN}")

@@ -1,6 +1,7 @@
 """Find pictures that show nothing, or not what the car saw.
 
-A camera that stood still, black or grey pictures, colours or sides that are not those of the other drives.
+A camera that stood still, black, white or grey pictures, a missing colour, a covered lens, colours or sides that are
+not those of the other drives.
 
     recordings = with_faults(recordings)     # its faults name them; `rover inspect` and notebook 01 do so
 
@@ -27,11 +28,13 @@ ENCODED = 3  # a PNG's or a video's picture costs some times more than a JPEG's,
 SEEN = (96, 72)  # width and height to which pictures are scaled down
 EQUAL = 0.05  # grey levels between two pictures, on average; a real camera's noise alone is 0.2
 FROZEN = 10  # equal pictures in a row; a car that has just been started may stand for some
-REPEATED = 0.3  # the share of equal neighbours; of public tubs at most 0.13
+REPEATED, OF_ONE = 0.2, 0.22  # the share of equal neighbours; of public tubs at most 0.13, of one drive 0.19
 MOVES = 0.01  # of throttle; a simulated car that stands sees equal pictures
 FLAT = 8.0  # grey levels between the darkest and the brightest part; of real pictures 37 and more
 BLANK = 0.05  # the share of a drive's pictures
 DARK, BRIGHT = 24.0, 231.0
+COVERED, DARK_PLACE = 0.2, 0.05  # the share of a picture that is always dark; beside drives with hardly any
+CLIPPED, DAZZLED = 250, 0.5  # a white pixel, and their share in half of the pictures
 COMPARED = 30  # samples of a drive; fewer show what the car stood before, or who carried it
 COLOURLESS, COLOURED = 0.5, 4.0  # grey levels between a picture's colours, on average
 LEAST_COMPARED = 12  # pairs of pictures
@@ -56,10 +59,34 @@ class _Drive:
         return self.longest >= FROZEN
 
     @cached_property
+    def _blocks(self) -> np.ndarray:
+        return self.pictures.reshape(len(self.pictures), 8, SEEN[1] // 8, 12, SEEN[0] // 12, 3).mean((2, 4))
+
+    @cached_property
     def flat(self) -> np.ndarray:
         """Whether each picture is of one colour, (n,) bool."""
-        blocks = self.pictures.reshape(len(self.pictures), 8, SEEN[1] // 8, 12, SEEN[0] // 12, 3).mean((2, 4))
-        return np.ptp(blocks, axis=(1, 2)).max(1) < FLAT
+        return np.ptp(self._blocks, axis=(1, 2)).max(1) < FLAT
+
+    @property
+    def shows_nothing(self) -> bool:
+        return self.flat.mean() >= BLANK or self.white > DAZZLED or self.missing != ""
+
+    @cached_property
+    def covered(self) -> float:
+        """The share of a picture that is dark in all."""
+        return float((self._blocks.max((0, 3)) < DARK).mean())
+
+    @property
+    def white(self) -> float:
+        """The share of white pixels in the middle one of the pictures."""
+        return float(np.median((self.pictures.min(3) >= CLIPPED).mean((1, 2))))
+
+    @cached_property
+    def missing(self) -> str:
+        """The colour that no picture has beside the others, or ""."""
+        most = np.quantile(self.pictures, 0.99, axis=(0, 1, 2))
+        dark = most < DARK
+        return ("blue", "green", "red")[int(dark.argmax())] if dark.sum() == 1 else ""
 
 
 def with_faults(recordings: Recordings, progress: Progress = silent) -> Recordings:
@@ -75,7 +102,7 @@ def with_faults(recordings: Recordings, progress: Progress = silent) -> Recordin
                 drives.append(drive)
                 _note_nothing(drive, of_camera, faults)
         _note_repeated(drives, of_camera, faults)
-        _note_others([drive for drive in drives if drive.flat.mean() < BLANK], of_camera, faults)
+        _note_others([drive for drive in drives if not drive.shows_nothing], of_camera, faults)
     return replace(
         recordings, faults=tuple(sorted((*recordings.faults, *faults.listed()), key=lambda f: (f.file, f.kind)))
     )
@@ -139,6 +166,14 @@ def _note_nothing(drive: _Drive, of_camera: str, faults: Faults) -> None:
             word = "white"
         note = f"{flat.mean():.0%} of its pictures{of_camera} are {word}, and show nothing: leave them out"
         faults.add(drive.episode.place, "blank_pictures", note, max(round(flat.mean() * frames), 1))
+    elif drive.white > DAZZLED:
+        note = f"{drive.white:.0%} of its pictures{of_camera} are white: less light, or a shorter exposure"
+        faults.add(drive.episode.place, "blank_pictures", note, frames)
+    elif drive.missing:
+        note = (
+            f"its pictures{of_camera} have no {drive.missing}: leave it out, and look at the camera's cable and driver"
+        )
+        faults.add(drive.episode.place, "without_colours", note, frames)
     elif drive.frozen:
         count = max(round(drive.equal / drive.compared * frames), drive.longest)
         note = f"the picture{of_camera} stood still for {drive.longest} frames while actions changed: leave it out"
@@ -148,11 +183,16 @@ def _note_nothing(drive: _Drive, of_camera: str, faults: Faults) -> None:
 def _note_repeated(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> None:
     """Add a fault if all drives together, or one that was looked at often, have each picture several times."""
     rest = [drive for drive in drives if not drive.frozen]
+    often = [drive for drive in rest if drive.compared >= LEAST_COMPARED and not drive.shows_nothing]
+    alone = [drive for drive in often if drive.equal >= OF_ONE * drive.compared]
     compared, equal = sum(drive.compared for drive in rest), sum(drive.equal for drive in rest)
-    if compared >= LEAST_COMPARED and equal >= REPEATED * compared:
-        note = f"{equal / compared:.0%} of the pictures{of_camera} equal the next one, though the car moves"
-        files = sum(round(drive.episode.frames * equal / compared) for drive in rest)
-        faults.add(faults.root, "repeated_pictures", f"{note}: is the camera slower than the recording?", files)
+    all_of_them = compared >= LEAST_COMPARED and equal >= REPEATED * compared
+    for repeated in [rest] if all_of_them else [[drive] for drive in alone]:
+        share = sum(drive.equal for drive in repeated) / sum(drive.compared for drive in repeated)
+        note = f"{share:.0%} of the pictures{of_camera} equal the next one, though the car moves"
+        files = round(share * sum(drive.episode.frames for drive in repeated))
+        place = faults.root if all_of_them else repeated[0].episode.place
+        faults.add(place, "repeated_pictures", f"{note}: is the camera slower, or does it stop now and then?", files)
 
 
 def _note_others(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> None:
@@ -165,6 +205,15 @@ def _note_others(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> No
         if len(drive.episode.samples) >= COMPARED:
             sessions.setdefault(drive.episode.session or drive.episode.id, []).append(drive)
     long = list(sessions.values())
+    if len(long) < LEAST_DRIVES:
+        return
+    covered = np.array([min(piece.covered for piece in pieces) for pieces in long])
+    covered *= (covered < DARK_PLACE).mean() >= 0.5  # else the place is dark
+    for pieces, share in zip(long, covered.tolist(), strict=True):
+        for drive in pieces if share > COVERED else ():
+            note = f"{share:.0%} of each picture{of_camera} is black, and not of the other drives': leave it out"
+            faults.add(drive.episode.place, "covered_lens", f"{note}, and look at the lens", drive.episode.frames)
+    long = [pieces for pieces, share in zip(long, covered, strict=True) if share <= COVERED]
     if len(long) < LEAST_DRIVES:
         return
     pictures = [np.concatenate([piece.pictures for piece in pieces]) for pieces in long]

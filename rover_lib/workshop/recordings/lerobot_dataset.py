@@ -413,7 +413,7 @@ def _read_info(root: Path) -> dict[str, Any]:
     refuse_pointer(path, EpisodeError)
     with _as_episode_error(f"{path}: not readable as JSON"):
         info: Any = untrusted.read_json(path, INFO_BYTES)
-    if not isinstance(info, dict) or not info.keys() & {"codebase_version", "features", "data_path", "total_frames"}:
+    if not isinstance(info, dict) or not info.keys() & {"codebase_version", "data_path", "total_frames"}:
         remedy = "give a LeRobotDataset, donkeycar's tub, or a folder of episodes"
         problem = f"{root}: another program's {INFO}, not that of a LeRobotDataset"
         raise EpisodeError(problem, found=quote_all(info) if isinstance(info, dict) else quote(info), remedy=remedy)

@@ -32,6 +32,6 @@ def name_stranger(root: Path) -> tuple[str, str] | None:
     paths = [f"/{path.relative_to(root.parent).as_posix()}" for path in files]
     for line in TABLE.read_text().splitlines():
         pattern, words, *own = line.split("\t")
-        if any(re.search(pattern, path) for path in paths):
+        if any(re.search(pattern, path, re.IGNORECASE) for path in paths):
             return words, own[0] if own else READ
     return None

@@ -7,6 +7,7 @@ begins, and at a hole in time; its first record gives the next one its state, bu
 """
 
 import json
+import re
 import shlex
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -53,18 +54,20 @@ OTHER_SIGN = 0.75  # of the throttles that are not 0
 DEEPEST, MOST_FOLDERS = 3, 1000  # folders in folders that are looked into for tubs, and in each
 ASKS = "another sign"  # the kind of an error that is a question
 OLDER = "copy it again; donkeycar's convert_to_tub_v2.py converts a tub of record_<number>.json"
+PICTURE = "cam/image_array"
+PICTURES = r"\.(?i:jpe?g|png)$"
+ANGLE = "user/angle"
+THROTTLE = "user/throttle"
+MODE = "user/mode"
 REMEDIES = {  # by what most records were left out for
     "deleted_record": "restore them in donkeycar's tub manager, or copy the tub as it was before",
     "a_pilot_drove": "only a human's driving is learned from: record in user mode",
     "broken_record": OLDER,
+    "other_record": f"only a human's drives by a camera in colours are read: each needs {PICTURE}, {ANGLE}, {THROTTLE}",
     "catalog_missing": "copy the whole tub, catalogs included",
     "nothing": "nothing was recorded in it: give another",
 }
 COPY = "copy the whole tub, images included"
-PICTURE = "cam/image_array"
-ANGLE = "user/angle"
-THROTTLE = "user/throttle"
-MODE = "user/mode"
 
 
 @dataclass(frozen=True)
@@ -247,7 +250,8 @@ class _Tub:
                 try:
                     record = _parse(line, self.path)
                 except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as e:
-                    faults.add(self.path, "broken_record", f"{place}: {quote(str(e))}")
+                    kind = "other_record" if isinstance(e, KeyError) else "broken_record"
+                    faults.add(self.path, kind, f"{place}: {quote(str(e))}")
                     continue
                 self.began[record.session] = min(record.index, self.began.get(record.session, record.index))
                 if record.index in deleted:
@@ -340,12 +344,13 @@ def _read_manifest(path: Path) -> tuple[list[str], set[int]]:
 
 
 def _parse(text: str, tub: Path) -> _Record:
-    """Return the record in a line. Raises ValueError, also of other kinds, and EpisodeError for other cameras' tubs."""
+    """Return the record in a line. Raises ValueError, also of other kinds, and EpisodeError for other cars' tubs."""
     row = json.loads(text)
-    if PICTURE not in row and (similar := [key for key in row if key.startswith(f"{PICTURE}_")]):
+    similar = [key for key in row if key.startswith("cam/") and re.search(PICTURES, str(row[key]))]
+    if PICTURE not in row and similar:
         catalogs = f"{shlex.quote(str(tub))}/*.catalog"
         remedy = f"to use one, name it so in the catalogs: sed -i 's#{similar[0]}#{PICTURE}#' {catalogs}"
-        problem = f"{tub}: a record has no '{PICTURE}', as of two cameras"
+        problem = f"{tub}: a record has no '{PICTURE}', as of two cameras, or another"
         raise EpisodeError(problem, found=quote_all(similar), remedy=remedy)
     number = row["_index"]
     ms = row.get("_timestamp_ms")

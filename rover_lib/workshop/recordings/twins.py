@@ -1,4 +1,4 @@
-"""Leave out drives that are there twice: copies, and mirrored copies, as donkeycar's flop_tub makes them."""
+"""Leave out drives that are there twice: copies, mirrored ones, as of donkeycar's flop_tub, and backward ones."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,24 +11,26 @@ from rover_lib.workshop.recordings.samples import Episode
 
 
 def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episode, ...]:
-    """Return the episodes without copies of others, of which the longest is kept, and without mirrored ones.
+    """Return the episodes without copies of others, of which the longest is kept, nor mirrored or backward ones.
 
-    Held out, a mirrored drive is judged by a policy that was calibrated, or trained, on its twin.
+    Held out, such a drive is judged by a policy that was calibrated, or trained, on its twin.
     """
-    unique = list(episodes)
-    for episode, same in copies.find_copies(episodes):
-        faults.add(episode.place, "copy", f"the same drive as {same.id}, as its actions and pictures show")
-        unique.remove(episode)
-    originals = {_mirror(episode): episode for episode in unique}
-    twins = set[Episode]()
-    for pair in sorted(copies.find_copies((*unique, *originals)), key=lambda pair: pair[0].place.as_posix()):
-        pieces = [originals.get(episode, episode) for episode in pair]
-        first, second = sorted(pieces, key=lambda e: (-len(e.samples), unique.index(e)))
-        if first is not second and not twins & {first, second} and not _is_symmetric(first):
-            twins.add(second)
-            note = f"the same drive as {first.id}, mirrored, as its actions and pictures show"
+    turned = {_mirror(episode): (episode, ", mirrored") for episode in episodes}
+    turned |= {replace(episode, samples=episode.samples[::-1]): (episode, ", backwards") for episode in episodes}
+    left_out = set[Episode]()
+    pairs = copies.find_copies((*episodes, *turned))
+    for pair in sorted(pairs, key=lambda pair: (not turned.keys().isdisjoint(pair), pair[0].place.as_posix())):
+        pieces = [turned.get(episode, (episode, "")) for episode in pair]
+        (one, how), (other, how_other) = pieces
+        first, second = sorted((one, other), key=lambda e: (-len(e.samples), episodes.index(e)))
+        as_it_is = how == how_other == ""
+        if first is second or left_out & {first, second} or (how and how_other):
+            continue
+        if as_it_is or "mirrored" not in how + how_other or not _is_symmetric(first):
+            left_out.add(second)
+            note = f"the same drive as {first.id}{how or how_other}, as its actions and pictures show"
             faults.add(second.place, "copy", note)
-    return tuple(episode for episode in unique if episode not in twins)
+    return tuple(episode for episode in episodes if episode not in left_out)
 
 
 def _is_symmetric(episode: Episode) -> bool:

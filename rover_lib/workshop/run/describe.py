@@ -17,6 +17,7 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.source import Source
 
+DRIVES = 40  # whose sides are measured, so that a folder of any size takes seconds
 FIRST = "rover run makes the first; in a clone, make demo too"
 
 
@@ -46,7 +47,7 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
         check_kind(path, "recordings")  # says what to do
     if kind in ("recordings", "dataset", "tub") or (kind is None and path.is_dir()):
         recordings = with_faults(load_recordings(source, progress=progress), progress)
-        sides = measure_sides(recordings, progress)
+        sides = measure_sides(recordings, progress, DRIVES)
         content = recordings.summary()
         if sides.turnings:
             content |= {"steering": sides.words(), "by_episode": [turning.words() for turning in sides.turnings]}

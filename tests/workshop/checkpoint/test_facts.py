@@ -13,6 +13,7 @@ from safetensors.torch import load_file, save_file
 
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint.facts import WORDS, Facts
 from rover_lib.workshop.checkpoint.weights import check_weights_are_whole
 from rover_lib.workshop.recordings.samples import Layout
 from rover_lib.workshop.recordings.source import Source
@@ -148,14 +149,13 @@ def test_what_train_config_says(lerobots, said, size, refused):
 
 
 def test_a_forks_keys_are_asked_about(lerobots):
+    """When it is read, as by `rover inspect`: not only before a run's recordings."""
     edit(lerobots / "config.json", lambda c: c.update(use_coord_conv=True, resize_imgs=None))
-    assert "use_coord_conv" in load_checkpoint(lerobots).report["notes"][0]
-    say = remedied(lerobots, act=lambda path, said: load_checkpoint(path, said=said).recorded_as(Layout(rate_hz=20.0)))
-    assert "nobody here knows" in say
-    edit(lerobots / "config.json", lambda c: c.update(resize_imgs=[48, 64]))
+    assert "'use_coord_conv' is 'True', and nobody here knows" in remedied(lerobots)
+    edit(lerobots / "config.json", lambda c: c.update(use_coord_conv=None, resize_imgs=[48, 64]))
     assert "its pictures are 128x72: pass --facts size=WxH" in remedied(lerobots)
     assert load_checkpoint(lerobots, said="size=64x48").config.image_sizes == ((48, 64),)
-    edit(lerobots / "config.json", lambda c: c.update(resize_imgs=None))
+    edit(lerobots / "config.json", lambda c: c.update(use_coord_conv=True, resize_imgs=None))
     weights, key = load_file(lerobots / "model.safetensors"), "model.backbone.conv1.weight"
     weights[key] = torch.cat([weights[key], weights[key][:, :2]], 1)
     save_file(weights, lerobots / "model.safetensors")
@@ -168,7 +168,8 @@ def test_processors_and_adapters_that_change_actions_are_refused(lerobots):
     edit(lerobots / "policy_preprocessor.json", lambda c: c["steps"].append(unused))
     file, adapter = next(lerobots.glob("policy_post*.safetensors")), lerobots / "adapter_config.json"
     save_file(load_file(file) | {"action.std": torch.tensor([9.0, 9.0])}, file)
-    assert "contradict each other on its normalisation of actions" in remedied(lerobots)
+    assert "contradict each other on its 'action.std'" in remedied(lerobots)
+    assert "of other units" in load_checkpoint(lerobots, said="ignore=policy_preprocessor.json").report["notes"][-1]
     with pytest.raises(CheckpointError, match="of other units than a rover's"):
         load_checkpoint(lerobots, said="ignore=policy_preprocessor.json").recorded_as(Layout(("it",), rate_hz=20.0))
     adapter.touch()
@@ -194,8 +195,7 @@ def test_a_config_of_2024_is_read(lerobots):
         part = "unnormalize_outputs" if key == "action" else "normalize_inputs"
         weights[f"{part}.buffer_{key.replace('.', '_')}.{stat}"] = value.clone()
     save_file(weights, lerobots / "model.safetensors")
-    with pytest.raises(CheckpointError, match=r"remove policy_p\*processor.json$"):  # beside processors
-        load_checkpoint(lerobots)
+    assert "may mean how its numbers are normalised" in remedied(lerobots)  # beside processors
     for file in lerobots.glob("policy_p*processor.json"):
         file.unlink()
     assert load_checkpoint(lerobots).config == expected
@@ -239,10 +239,58 @@ def test_averaged_weights_are_asked_about_in_any_form_and_beside(tiny, tiny_poli
         path = says_more(tiny_policy, tmp_path / f"m{number}.pth", **more)
         assert "the weights that should drive" in remedied(path)
     files = {"norm_stats.json": "normalised", "ema.safetensors": "should drive", "model_swa.pt": "should"}
+    files |= {"best_avg.pth": "should drive", "min_max.csv": "normalised", "assets/car/normstats.json": "normalised"}
+    (lerobots / "assets/car").mkdir(parents=True)
     for name, words in files.items():
         (lerobots / name).write_text("{}")
         assert words in remedied(lerobots)
         (lerobots / name).unlink()
+    (lerobots / "ema").mkdir()
+    assert "should drive" in remedied(lerobots)
+    torch.save(trainer_content(tiny_policy), lerobots / "ema.pth")
+    assert load_checkpoint(lerobots / "ema.pth", said="ignore=ema").format == "trainer", "it is the one that is given"
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("ema_model_action_head_weight", "the weights that should drive"),
+        ("model_ema.modelaction_headweight", "the weights that should drive"),
+        ("normalizer.mean", "how its numbers are normalised"),
+        ("aux_head.weight", "nobody here knows what that does"),
+    ],
+)
+def test_weights_that_no_act_has_are_called_what_they_may_be(lerobots, name, words):
+    file = lerobots / "model.safetensors"
+    counts = {"model_ema.num_updates": torch.tensor(7)} if name.startswith("model_ema") else {}
+    save_file(load_file(file) | counts | {name: torch.zeros(2)}, file)
+    assert words in remedied(lerobots)
+
+
+def test_what_only_some_weights_lack_is_damage(lerobots):
+    file = lerobots / "model.safetensors"
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-100_000] + b"\xff" * 100_000)
+    with pytest.raises(CheckpointError, match="is the file damaged"):
+        load_checkpoint(lerobots)
+    file.rename(file.with_suffix(".safetensors.part"))
+    with pytest.raises(CheckpointError, match=r"found model\.safetensors\.part"):
+        load_checkpoint(lerobots)
+
+
+def test_statistics_of_two_trainings_are_refused(lerobots):
+    file = next(lerobots.glob("policy_post*.safetensors"))
+    stats = load_file(file)
+    save_file(stats | {"observation.state.mean": stats["observation.state.mean"] + 1}, file)
+    assert "contradict each other on its 'observation.state.mean'" in remedied(lerobots)
+
+
+def test_a_config_is_read_as_lerobot_does():
+    from lerobot.policies.act.configuration_act import ACTConfig
+
+    usual = vars(ACTConfig(device="cpu"))
+    assert usual.keys() <= {*WORDS["act"], *WORDS["of_lerobot"]}
+    assert {name: usual[name] for name in WORDS["act"]} == WORDS["act"]
 
 
 def test_weights_that_were_not_copied_to_their_end_are_called_damaged(lerobots):
@@ -262,19 +310,20 @@ def test_actions_that_are_held_have_rows_of_zeros(held, torn, damaged):
     whole["model.action_head.weight"][0, :torn] = 0
     if damaged:
         with pytest.raises(CheckpointError, match="damaged"):
-            check_weights_are_whole(Path("p"), whole)
+            check_weights_are_whole(Facts(Path("p")), whole)
     else:
-        assert set(check_weights_are_whole(Path("p"), whole)) == {"action_head.weight"}
+        assert set(check_weights_are_whole(Facts(Path("p")), whole)) == {"action_head.weight"}
 
 
 def test_a_state_that_never_varied_is_given_to_the_network_as_it_was(lerobots):
     """The car's last action, in deviations of 1e-8, made of a policy that drove one that hit 4 of 8 balloons."""
-    file, state = next(lerobots.glob("policy_pre*.safetensors")), "observation.state"
-    stats = load_file(file)
+    files, state = [*lerobots.glob("policy_p*.safetensors")], "observation.state"
+    stats = load_file(files[0])
     whole = load_checkpoint(lerobots)
     was = stats[f"{state}.mean"].clone()
     for std in (0.0, 1e-8):
-        save_file(stats | {f"{state}.std": torch.tensor([std, 0.3])}, file)
+        for file in files:
+            save_file(stats | {f"{state}.std": torch.tensor([std, 0.3])}, file)
         found = load_checkpoint(lerobots)
         (note,) = (each for each in found.report["notes"] if "never varied" in each)
         assert "its state (steering)" in note
@@ -285,6 +334,7 @@ def test_a_state_that_never_varied_is_given_to_the_network_as_it_was(lerobots):
         seen = found.weights[f"{project}.weight"] @ given + found.weights[f"{project}.bias"]
         trained = whole.weights[f"{project}.weight"] @ torch.tensor([0.0, 1.0]) + whole.weights[f"{project}.bias"]
         assert torch.allclose(seen, trained, atol=1e-5)
-    save_file(stats | {f"{state}.mean": was * 100, f"{state}.std": stats[f"{state}.std"] * 100}, file)
+    for file in files:
+        save_file(stats | {f"{state}.mean": was * 100, f"{state}.std": stats[f"{state}.std"] * 100}, file)
     assert any("not its last action" in note for note in load_checkpoint(lerobots).report["notes"])
     assert not whole.report["notes"]

@@ -61,6 +61,15 @@ def blank(value, share=2):
     return change
 
 
+def part(rows, value):
+    def change(pictures):
+        changed = pictures.copy()
+        changed[:, rows] = value
+        return changed
+
+    return change
+
+
 def grey(pictures):
     return np.repeat(pictures.mean(-1, keepdims=True), 3, -1).astype(np.uint8)
 
@@ -75,6 +84,12 @@ def grey(pictures):
         (blank((0, 130, 0)), "blank_pictures"),
         (blank(250, 5), "blank_pictures"),
         (grey, "without_colours"),
+        (lambda pictures: pictures * np.uint8((1, 1, 0)), "without_colours"),
+        (lambda pictures: pictures * np.uint8((1, 0, 1)), "without_colours"),
+        (lambda pictures: np.minimum(pictures * 5.0, 255).astype(np.uint8), "blank_pictures"),
+        (part(slice(36), 4), "covered_lens"),
+        (part(slice(36, 72), 4), "covered_lens"),
+        (lambda pictures: pictures[np.arange(FRAMES) // 2 * 2], "repeated_pictures"),
         (lambda pictures: pictures[..., ::-1], "swapped_colours"),
         (lambda pictures: pictures[:, ::-1, ::-1], "upside_down"),
         (lambda pictures: pictures[:, ::-1], "upside_down"),
@@ -110,6 +125,20 @@ def test_steering_that_never_changes_is_named_and_a_held_throttle_is_not(factors
     still = replace(first, samples=tuple(replace(sample, chunk=sample.chunk * factors) for sample in first.samples))
     cautions = replace(found, episodes=(still,)).cautions()
     assert any("steering is 0 throughout" in caution for caution in cautions) == named
+
+
+@pytest.mark.parametrize("odd", [[2], range(DRIVES)])
+def test_a_camera_that_stops_now_and_then_is_named(odd):
+    """For 6 pictures of 20, in one drive or in all."""
+    k = np.arange(FRAMES)
+    (fault,) = recordings(lambda pictures: pictures[np.where(k % 20 < 6, k - k % 20, k)], odd).faults
+    assert fault.kind == "repeated_pictures" and fault.file == ("e2" if odd == [2] else ".")
+
+
+def test_a_dark_place_is_no_covered_lens():
+    """But one that is dark in half of the drives alone is."""
+    assert not recordings(part(slice(36), 4), range(DRIVES)).faults
+    assert {fault.kind for fault in recordings(part(slice(36), 4), (0, 1, 2)).faults} == {"covered_lens"}
 
 
 @pytest.mark.parametrize("times", [2, 3])

@@ -82,6 +82,10 @@ def test_a_tub_of_two_cameras_is_told_how_to_use_one(tmp_path):
         read_tub(root, Car())
     subprocess.run(e.value.remedy[e.value.remedy.index("sed ") :], shell=True, check=True)
     assert len(read_tub(root, Car()).samples) == 40
+    for catalog in root.glob("*.catalog"):
+        catalog.write_text(catalog.read_text().replace("user/angle", "pilot/angle"))
+    with pytest.raises(EpisodeError, match=r"other_record 40 times.*only a human's drives"):
+        read_tub(root, Car())
 
 
 def test_runs_of_a_few_records_and_odd_times_have_no_rate(tmp_path):
@@ -152,8 +156,8 @@ def test_what_is_broken_is_counted(tmp_path):
     (root / "images" / "20_cam_image_array_.jpg").unlink()
     (root / "images" / "21_cam_image_array_.jpg").write_bytes(b"\xff\xd8 cut")
     found = kinds(read_tub(root, LEFT))
-    expected = {"broken_record": 5, "records_missing": 1, "frame_missing": 1, "broken_jpeg": 1, "deleted_record": 2}
-    assert found == expected
+    expected = {"broken_record": 4, "other_record": 1, "records_missing": 1}
+    assert found == expected | {"frame_missing": 1, "broken_jpeg": 1, "deleted_record": 2}
     deleted = '{"paths": ["catalog_0.catalog"], "deleted_indexes": [1e400]}'
     for manifest in ('{"paths": 1}', deleted, "", " " * 10_000_001, None):
         (root / "manifest.json").unlink()

@@ -47,6 +47,13 @@ def test_a_mirrored_copy_of_each_drive_is_left_out(noise, frames):
     assert "mirrored" in notes["b/t2"] and "a/e2" in notes["b/t2"] and "a/e0" in notes["again"]
 
 
+def test_a_drive_that_is_there_backwards_is_left_out():
+    drives, faults = [drive(seed) for seed in range(3)], Faults(Path("r"))
+    backwards = replace(drives[1], id="t", samples=drives[1].samples[25:3:-1])
+    assert leave_out_copies([*drives, backwards], faults) == tuple(drives)
+    assert "e1, backwards" in faults.listed()[0].note
+
+
 @pytest.mark.parametrize(("same", "kept"), [(6, ["a/e0"]), (5, ["part", "a/e0"])])
 def test_three_of_ten_runs_of_four_actions_make_a_copy(same, kept):
     whole = drive(0)
