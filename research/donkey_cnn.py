@@ -75,7 +75,7 @@ def varied(pictures: Tensor, augmentation: Augmentation, rng: np.random.Generato
     """Return pictures, (n, 3, 60, 80) uint8, varied, as float32 from 0 to 255."""
     moved = torch.from_numpy(augmentation.shifted(pictures.permute(0, 2, 3, 1).contiguous().numpy(), rng))
     drawn = augmentation.draw(len(moved), rng)
-    return vary(moved, {name: torch.from_numpy(values) for name, values in drawn.items()})
+    return vary(moved, {name: torch.from_numpy(values) for name, values in drawn.items()}).contiguous()
 
 
 def train(
