@@ -113,6 +113,25 @@ def test_names_that_look_like_torchs_counter_are_kept_in_the_content_hash(artifa
     assert len(hashes) == 4
 
 
+def test_a_content_hash_by_hand(tmp_path):
+    """By sha256sum: each name and a zero, then its record's digest, without torch's debug table, serial and counter."""
+    name, digest = "a___torch_mangle_7", "cc03aae46f5b5005576df9b369348e518410ff96e636daffe9f53ca4517d8fd2"
+    records = {
+        "archive/version": "3",
+        "archive/data.pkl": f"__torch__.{name} and x___torch_mangle_7",
+        f"archive/code/__torch__/{name}.py": f"return __torch__.{name}",
+        f"archive/code/__torch__/{name}.py.debug_pkl": "lines",
+        "archive/.data/serialization_id": "12",
+        "archive/constants.pkl": "c",
+        "archive/extra/manifest.json": "{}",
+        "archive/extra/parity.npz": "p",
+    }
+    with zipfile.ZipFile(tmp_path / "a.pt", "w") as z:
+        for record, content in records.items():
+            z.writestr(record, content)
+    assert content_hash(tmp_path / "a.pt") == digest
+
+
 def line_before_end(line: str):
     """Return an edit that inserts a line before the end of a program, whose answer is y."""
 

@@ -338,6 +338,18 @@ def test_an_artifact_says_what_it_is(tiny, calibration, tmp_path):
     assert read_manifest(tmp_path / "b.pt")["parity"]["tolerance"]["steering"] == pytest.approx(1e-4)
 
 
+def test_a_tolerance_by_hand(tiny):
+    """FP32's grows with an action beyond 1; INT8's is so many times its largest error, and never less than FP32's."""
+    exporter = Exporter(tiny, memory_samples(2))
+    exporter.parity = {"vectors": 2, "fp32": 0.001, "int8_errors": 3}
+    exporter.float_actions = torch.tensor([[[0.5, 40.0]], [[-0.5, 20.0]]])
+    actions = exporter.float_actions + torch.tensor([[[0.1, 0.01]], [[-0.2, 0.0]]])
+    for policy, wanted in ((exporter.float_policy, [0.001, 0.04001]), (off_by(tiny, 0, 0), [0.6, 0.04001])):
+        found = exporter._tolerance(policy, actions, np.array([0, 1]))
+        assert [*found.values()] == pytest.approx(wanted, rel=1e-4)
+    assert exporter._tolerance(policy, actions[1:], np.array([1]))["throttle"] == pytest.approx(0.02)
+
+
 def test_a_badly_written_graph_sets_no_tolerance_for_itself(tiny, calibration, tmp_path, monkeypatch):
     """Steering may differ here, throttle may not."""
 
