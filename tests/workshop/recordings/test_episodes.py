@@ -502,7 +502,10 @@ def test_few_episodes_are_parted_along_time_with_a_gap(tmp_path):
         for before, after in pairwise(times):
             # A chunk's last action is (CHUNK - 1) frames after its frame, so no action is shared.
             assert min(after) - max(before) > (CHUNK - 0.5) / 30
-    assert len(parts.calibration) > len(parts.choosing) + len(parts.held_out)
+        # Without two gaps of 8, 44 of 60 frames are left, and 11 of these are held out: 5 choose, 6 judge.
+        assert [len(part) for part in times] == [33, 5, 6]
+    smallest = split(load(record(tmp_path / "smallest", frames=2 * CHUNK + 3)))
+    assert [len(smallest.calibration), len(smallest.choosing), len(smallest.held_out)] == [1, 1, 1]
     with pytest.raises(EpisodeError, match="too short to be parted"):
         split(load(record(tmp_path / "short", frames=2 * CHUNK)))
 
