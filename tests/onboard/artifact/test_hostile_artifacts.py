@@ -77,6 +77,7 @@ MANIFESTS = [
     ({"cameras": [CAMERA] * 2}, "cameras"),
     ({"cameras": [CAMERA | {"width": 256}]}, "another shape"),
     ({"state_names": ["steering\x1b[2J", "throttle"]}, "unprintable"),
+    ({"state_names": ["s" * 65, "throttle"]}, "names"),
     ({"parity": {"tolerance": {"steering": 1e9, "throttle": 0}}}, "tolerance of steering"),
     ({"parity": {"tolerance": {"steering": 0}}}, "cover"),
     ({"engine": "onnxruntime"}, "another engine"),
@@ -86,6 +87,8 @@ MANIFESTS = [
 def test_no_impossible_manifest_is_believed(artifacts, tmp_path):
     for values, message in MANIFESTS:
         refused(hostile(artifacts, tmp_path, {"manifest.json": manifest_with(**values)}), message)
+    with Artifact(hostile(artifacts, tmp_path, {"manifest.json": manifest_with(state_names=["s" * 64, "t"])})) as whole:
+        assert whole.manifest["state_names"] == ["s" * 64, "t"]
     for raw in (b"[" * 50_000, b"[]", b"\xff"):
         refused(hostile(artifacts, tmp_path, {"manifest.json": lambda _, raw=raw: raw}), "manifest is not")
 
