@@ -56,6 +56,13 @@ def test_a_command_at_each_absolute_deadline(link, clock):
     assert json.loads(json.dumps(report.summary()))["jitter_max_ms"] == pytest.approx(20, abs=0.1)
 
 
+def test_a_deadline_that_is_missed_is_left_out(link, clock):
+    """Work of 80 ms covers the next deadline and a third of the time to the one after it."""
+    report = go(Always({30: lambda: clock.sleep(0.08)}), link, clock, until=Until(ticks=60))
+    assert (report.ticks, report.missed) == (60, 1)
+    assert link.sent_at[-1] - link.sent_at[0] == pytest.approx(60 * PERIOD, abs=1e-6)
+
+
 def stopped_in_turn(clock, stopped_s, every_s, *, until):
     """Sleeps as a process sleeps that is stopped for a part of each turn, from a second on (SIGSTOP and SIGCONT)."""
 
