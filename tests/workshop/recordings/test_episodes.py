@@ -469,6 +469,11 @@ def test_no_recordings_is_one_sentence(tmp_path, make):
         assert "\n" not in str(e.value) and ("sync_s above 0" in str(e.value)) == bool(options)
 
 
+def test_the_folder_in_which_one_stands_names_its_episode(tmp_path, monkeypatch):
+    monkeypatch.chdir(record(tmp_path))
+    assert load(".").episodes[0].id == "episode_20260101_120000"
+
+
 # ---- splitting and choosing ------------------------------------------------------------------------------
 
 
