@@ -166,6 +166,13 @@ def test_the_arduino_has_the_last_word(link, clock, change, match):
     assert len(link.drives) == 3 and link.said[-1] == "neutral"
 
 
+@pytest.mark.parametrize(("boot", "why"), [(8, "watchdog"), (7, "unknown reason")])
+def test_why_the_arduino_was_reset(link, clock, boot, why):
+    link.hello = replace(link.hello, boot=boot, reset="watchdog")  # of the start that is meant, or the one before
+    with pytest.raises(DriveFault, match=rf"was reset \({why}\)"):
+        go(Always({3: lambda: setattr(link, "status", replace(link.status, boot=8))}), link, clock)
+
+
 def test_what_was_not_acknowledged_is_sent_again(clock):
     link = Link(clock, acknowledge=lambda n: n % 3 == 0)  # two of three get lost
     report = go(Always(), link, clock, until=Until(ticks=30))
