@@ -173,6 +173,19 @@ def test_why_the_arduino_was_reset(link, clock, boot, why):
         go(Always({3: lambda: setattr(link, "status", replace(link.status, boot=8))}), link, clock)
 
 
+def test_a_port_that_is_stuck_is_said_once(link, clock):
+    log, whole, calls = Log(), link.send, iter(range(100))
+
+    def send(*pulses):
+        if next(calls) in (5, 6):
+            raise LinkError("stuck")
+        return whole(*pulses)
+
+    link.send = send
+    go(Always(), link, clock, log, until=Until(ticks=20))
+    assert len([text for text in log.events if "a command was not sent: stuck" in str(text)]) == 1
+
+
 def test_what_was_not_acknowledged_is_sent_again(clock):
     link = Link(clock, acknowledge=lambda n: n % 3 == 0)  # two of three get lost
     report = go(Always(), link, clock, until=Until(ticks=30))
