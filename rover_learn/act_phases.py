@@ -193,11 +193,6 @@ def train_in_phases(
     actions = data.chunks[~data.is_pad]
     mean = actions.mean(axis=0)
     spread = np.maximum(actions.std(axis=0), 1e-3)
-    # Errors count in % of the range, so that a throttle that is held does not outweigh steering by its noise. The
-    # largest spread counts 1, as LeRobot's loss has a second part.
-    counting = judges.varies if judges.varies.any() else np.ones_like(judges.varies)
-    weights = 1 / judges.ranges / (spread / judges.ranges)[counting].max()
-    weights[~counting] *= HELD_WEIGHT
     with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
         torch.manual_seed(seed)
         policy = lerobot_act(size)
@@ -207,7 +202,7 @@ def train_in_phases(
             policy.model.action_head.bias.copy_(torch.from_numpy(mean))
         saved.machine.taking(policy)
         rng = np.random.default_rng([seed, 77])
-        loss_weights = torch.from_numpy(weights.astype(np.float32)).to(saved.machine.device)
+        loss_weights = torch.from_numpy(loss_weights_of(judges, spread)).to(saved.machine.device)
         training = PolicyTraining(first, policy, data, frames, judges, recipe, loss_weights, rng, saved, say)
         backbone = saved.machine.taking(live_backbone(pretrained))
         head = PlanFromFeatures(backbone, mean, spread, size.chunk).to(saved.machine.device)
@@ -234,6 +229,18 @@ def train_in_phases(
         "best_val_loss": np.float64(np.abs(plans - judges.chunks)[~judges.is_pad].mean()),
     }
     return checkpoint, judges.summary(errors)
+
+
+def loss_weights_of(judges: Judges, spread: np.ndarray) -> np.ndarray:
+    """Return the weight of each action's error, (A,) float32. spread: (A,) of what is learned.
+
+    Errors count in % of the range, so that a throttle that is held does not outweigh steering by its noise. The largest
+    spread counts 1, as LeRobot's loss has a second part.
+    """
+    counting = judges.varies if judges.varies.any() else np.ones_like(judges.varies)
+    weights = 1 / judges.ranges / (spread / judges.ranges)[counting].max()
+    weights[~counting] *= HELD_WEIGHT
+    return weights.astype(np.float32)
 
 
 def _hold(

@@ -1,15 +1,19 @@
-"""Plant slips, each in a copy, and see that a test fails: `make mutants`.
+"""Plant slips, one at a time, and see that a test fails: `make mutants`.
 
 A program draws lines of the judging, quantizing, recording, learning and driving code, each file in proportion to its
 lines, and plants a slip in each: a `<` becomes a `<=`, a 3 a 4, an `and` an `or`. cosmic-ray finds and makes the slips.
-The tests that run are those of the file's name, then those that import it, then its room's, up to the first that
-fails, or hangs; what failed must pass without slips. What survives needs a test, or a reason in survivors.yml.
+The tests that reach the line run first, the shortest first, then those of the file's name, up to the first that fails,
+or hangs; what failed must pass without slips. What survives needs a test, or a reason in survivors.yml.
+
+Each job has one copy of the repository, and there a process that has imported torch and LeRobot once and forks for each
+run of tests. Which tests reach which line is measured once, and kept in runs/mutants until a file changes.
 
 What cosmic-ray cannot do stands in planted.yml: lines of the firmware, and lines that random drives must notice. A row
 has a `name`, a `file`, the `good` text that stands in it once, the `bad` text that takes its place, and the `test` file
 whose tests that match `words` (pytest's -k) must fail; with `random: true`, random drives must notice it too.
 """
 
+import json
 import os
 import random
 import re
@@ -18,12 +22,18 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
+from hashlib import sha256
+from importlib.util import cache_from_source
+from itertools import chain
 from pathlib import Path
+from subprocess import PIPE
 from typing import Any
+from xml.etree import ElementTree
 
 import yaml
 
@@ -37,10 +47,24 @@ DRIVE = f"""
 from lab.driving.random_drives import random_drives
 raise SystemExit({NOTICED} * any(random_drives(range(i, i + 100))["broken"] for i in range(0, {RANDOM_DRIVES}, 100)))
 """
-PYTEST = ("-m", "pytest", "-q", "-x", "-p", "no:nbval", "-p", "no:cacheprovider", "-o", "addopts=--strict-markers")
+HANGS_S = 900  # a slip may make a loop endless; then it is caught
+# Runs pytest in a forked process for each line of its input, options as JSON, and prints its exit code.
+SERVER = f"""
+import json, os, signal, sys
+import cv2, hypothesis, lerobot.policies.act.modeling_act, pandas, pytest, torch, torchvision
+for line in sys.stdin:
+    if not (child := os.fork()):
+        os.setpgid(0, 0)
+        signal.alarm({HANGS_S})
+        log = os.open("pytest.log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(log, 1)
+        os.dup2(log, 2)
+        sys.exit(int(pytest.main(json.loads(line))))
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+PYTEST = ("-q", "-x", "-p", "no:nbval", "-p", "no:cacheprovider", "-o", "addopts=--strict-markers")
 FAST, SLOW = "not slow and not release and not emulated", "slow and not release"
-ENDLESS = ("-o", "faulthandler_timeout=200", "-o", "faulthandler_exit_on_timeout=true")  # for a fast test; then caught
-HANGS_S = 900.0  # a slip may make a loop endless; then it is caught
+MAPPED = ("tests/onboard", "tests/workshop", "tests/rover_learn", "tests/rover_exchange")
 HERE = Path(__file__).parent
 ROOMS = (
     *(f"rover_lib/workshop/{room}" for room in ("judge", "int8", "checkpoint", "recordings", "run")),
@@ -59,181 +83,189 @@ SLIPS = re.compile(
 
 
 @dataclass(frozen=True)
-class Slip:
-    """A line that cosmic-ray can break. occurrence: of the operator in the file."""
-
-    file: str
-    line: int
-    operator: str
-    occurrence: int
-    random = False  # whether random drives must notice it
-
-    def plant(self, good: str) -> str:
-        """Return the file's text with the slip in it."""
-        from cosmic_ray import mutating, plugins
-
-        return mutating.mutate_code(good, plugins.get_operator(self.operator)(), self.occurrence) or good
-
-    def name_in(self, good: str) -> str:
-        """Say what becomes of the line."""
-        before, after = (text.splitlines()[self.line - 1].strip() for text in (good, self.plant(good)))
-        return f"{self.file}:{self.line}: {before}  ->  {after}"
-
-    def runs(self) -> list[tuple[str, ...]]:
-        """Return pytest's options for each run of tests that may notice it, slow tests last."""
-        stages = tests_of(self.file)
-        return [(*ENDLESS, "-m", FAST, *tests) for tests in stages] + [("-m", SLOW, *tests) for tests in stages]
-
-
-def slips_in(file: str) -> list[Slip]:
-    """Return all slips that may be planted in a file."""
-    from cosmic_ray import ast, plugins
-
-    nodes = list(ast.ast_nodes(ast.get_ast((REPOSITORY / file).read_text())))
-    slips = []
-    for name in filter(SLIPS.fullmatch, plugins.operator_names()):
-        operator = plugins.get_operator(name)()
-        lines = [start[0] for node in nodes for start, _ in operator.mutation_positions(node)]
-        slips += [Slip(file, line, name, occurrence) for occurrence, line in enumerate(lines)]
-    return slips
-
-
-def draw_slips(count: int) -> list[Slip]:
-    """Draw slips, files in proportion to their lines, one on a line. The first of a longer draw are the same."""
-    paths = [path for room in ROOMS for path in sorted((REPOSITORY / room).rglob("*.py")) or [REPOSITORY / room]]
-    files = [path.relative_to(REPOSITORY).as_posix() for path in paths]
-    sizes = [len(path.read_text().splitlines()) for path in paths]
-    slips = {file: slips_in(file) for file in files}
-    chance = random.Random(SEED)
-    drawn: dict[tuple[str, int], Slip] = {}
-    while len(drawn) < count:
-        (file,) = chance.choices(files, sizes)
-        if lines := sorted({slip.line for slip in slips[file]}):
-            line = chance.choice(lines)
-            slip = chance.choice([slip for slip in slips[file] if slip.line == line])
-            with suppress(SyntaxError):
-                compile(slip.plant((REPOSITORY / file).read_text()), "a slip", "exec")
-                drawn.setdefault((file, line), slip)
-    return list(drawn.values())
-
-
-def tests_of(file: str) -> list[list[str]]:
-    """Return the tests that may notice a slip in a file, the likely first: of its name, that import it, of its room."""
-    path = Path(file)
-    tests, module = REPOSITORY / "tests", file.removesuffix(".py").replace("/", ".")
-    room = tests / path.parent.as_posix().removeprefix("rover_lib/")
-    package, _, stem = module.rpartition(".")
-    imported = re.compile(rf"(from|import) {re.escape(module)}\b|from {re.escape(package)} import .*\b{stem}\b")
-    stages: list[list[str]] = [[], [], []]
-    for test in sorted(tests.rglob("test_*.py")):
-        name = test.relative_to(REPOSITORY).as_posix()
-        if test.name == f"test_{path.stem}.py":
-            stages[0].append(name)
-        elif imported.search(test.read_text()):
-            stages[1].append(name)
-        elif test.parent == room:
-            stages[2].append(name)
-    return [stage for stage in stages if stage]
-
-
-@dataclass(frozen=True)
 class Mutant:
-    """A line that is broken by hand: a row of planted.yml."""
+    """A file with a broken line. name: says which. text: the whole file's. random: random drives must notice it too.
+
+    runs: pytest's options for each run of tests that may notice it, slow tests last.
+    """
 
     name: str
     file: str
-    good: str
-    bad: str
-    test: str
-    words: str
+    text: str
+    runs: Sequence[Sequence[str]]
     random: bool = False
-
-    def plant(self, good: str) -> str:
-        """Return the file's text with the broken line. Raises RoverError unless the line is there once."""
-        if (count := good.count(self.good)) != 1:
-            raise RoverError(f"{self.file}: {self.good!r} is there {count} times", remedy=f"mend {self.name!r}")
-        return good.replace(self.good, self.bad)
-
-    def name_in(self, good: str) -> str:
-        """Return its name."""
-        return self.name
-
-    def runs(self) -> list[tuple[str, ...]]:
-        """Return pytest's options for the tests that must notice it."""
-        return [("-k", self.words, self.test)]
 
 
 def read_mutants() -> list[Mutant]:
-    """Read the table of mutants."""
-    return [Mutant(**row) for row in yaml.safe_load((HERE / "planted.yml").read_text())]
+    """Read planted.yml. Raises RoverError for a line that is not there once."""
+    mutants = []
+    for row in yaml.safe_load((HERE / "planted.yml").read_text()):
+        good = (REPOSITORY / row["file"]).read_text()
+        if (count := good.count(row["good"])) != 1:
+            raise RoverError(f"{row['file']}: {row['good']!r} is there {count} times", remedy=f"mend {row['name']!r}")
+        text = good.replace(row["good"], row["bad"])
+        runs = [("-k", row["words"], row["test"])]
+        mutants.append(Mutant(row["name"], row["file"], text, runs, row.get("random", False)))
+    return mutants
 
 
-@contextmanager
-def broken_copy(file: str, change: Callable[[str], str]) -> Iterator[Path]:
-    """Yield a copy of the repository's files, those that git does not know yet too, in which a file is changed."""
-    listed = run("git", "-C", REPOSITORY, "ls-files", "-co", "--exclude-standard", error=RoverError)
-    with tempfile.TemporaryDirectory(prefix="rover-mutant-") as scratch:
-        folder = Path(scratch)
+def slips_in(code: str) -> dict[int, list[tuple[Any, int]]]:
+    """Return by line the slips that may be planted in a file: cosmic-ray's operator, and which of its places."""
+    from cosmic_ray import ast, plugins
+
+    nodes = list(ast.ast_nodes(ast.get_ast(code)))
+    slips: dict[int, list[tuple[Any, int]]] = {}
+    for name in filter(SLIPS.fullmatch, plugins.operator_names()):
+        operator = plugins.get_operator(name)()
+        lines = [start[0] for node in nodes for start, _ in operator.mutation_positions(node)]
+        for occurrence, line in enumerate(lines):
+            slips.setdefault(line, []).append((operator, occurrence))
+    return slips
+
+
+def drawn_files() -> list[Path]:
+    """Return the files that slips are drawn from."""
+    return [path for room in ROOMS for path in sorted((REPOSITORY / room).rglob("*.py")) or [REPOSITORY / room]]
+
+
+def draw_slips(count: int) -> list[Mutant]:
+    """Draw slips, files in proportion to their lines, one on a line. The first of a longer draw are the same."""
+    from cosmic_ray import mutating
+
+    files = {path.relative_to(REPOSITORY).as_posix(): path.read_text() for path in drawn_files()}
+    sizes = [len(code.splitlines()) for code in files.values()]
+    slips = {file: slips_in(code) for file, code in files.items()}
+    chance = random.Random(SEED)
+    drawn: dict[tuple[str, int], Mutant] = {}
+    while len(drawn) < count:
+        (file,) = chance.choices(list(files), sizes)
+        if not slips[file]:
+            continue
+        line = chance.choice(sorted(slips[file]))
+        text = mutating.mutate_code(files[file], *chance.choice(slips[file][line])) or files[file]
+        before, after = (code.splitlines()[line - 1].strip() for code in (files[file], text))
+        with suppress(SyntaxError):
+            compile(text, "a slip", "exec")
+            name = f"{file}:{line}: {before}  ->  {after}"
+            drawn.setdefault((file, line), Mutant(name, file, text, runs_of(file, line)))
+    return list(drawn.values())
+
+
+def runs_of(file: str, line: int) -> list[tuple[str, ...]]:
+    """Return pytest's options for the tests that reach a line, and for all in the test file of its file's name."""
+    own = [
+        path.relative_to(REPOSITORY).as_posix() for path in (REPOSITORY / "tests").rglob(f"test_{Path(file).stem}.py")
+    ]
+    runs = [(FAST, tests_that_reach(file, line)), (FAST, own), (SLOW, own)]
+    return [("-m", marks, *tests) for marks, tests in runs if tests]
+
+
+@cache
+def measure_tests() -> tuple[Any, dict[str, float]]:
+    """Return the coverage of each fast test, and the seconds of each that passes; measured once for these files."""
+    from coverage import CoverageData
+
+    key = sha256(b"".join(path.read_bytes() for path in drawn_files())).hexdigest()[:12]
+    folder = REPOSITORY / "runs" / "mutants" / key
+    report, coverage = folder / "tests.xml", folder / "coverage"
+    if not report.exists():
+        packages = [f"--cov={name}" for name in ("rover_lib", "rover_learn", "rover_exchange")]
+        options = ("--cov-context=test", "--cov-report=", "--junit-xml", str(report), "-m", FAST, *MAPPED)
+        command = [sys.executable, "-m", "pytest", *PYTEST, "--maxfail=1000", *packages, *options]
+        subprocess.run(command, cwd=REPOSITORY, env=os.environ | {"COVERAGE_FILE": str(coverage)}, stdout=sys.stderr)
+    data, seconds = CoverageData(str(coverage)), {}
+    data.read()
+    for case in ElementTree.parse(report).iter("testcase"):
+        if not len(case):  # else it was skipped, or failed
+            seconds[f"{case.get('classname', '').replace('.', '/')}.py::{case.get('name')}"] = float(
+                case.get("time", 0)
+            )
+    return data, seconds
+
+
+def tests_that_reach(file: str, line: int) -> list[str]:
+    """Return the tests that reach a line, the shortest first; those that reach its file if it runs at import."""
+    data, seconds = measure_tests()
+    contexts = data.contexts_by_lineno(str(REPOSITORY / file))
+    for lines in ([line], contexts):
+        names = {context.rpartition("|")[0] for number in lines for context in contexts.get(number, ())}
+        if tests := names & seconds.keys():
+            return sorted(tests, key=seconds.__getitem__)
+    return []
+
+
+class Bench:
+    """A copy of the repository in a folder, and a process that runs its tests there."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        listed = run("git", "-C", REPOSITORY, "ls-files", "-co", "--exclude-standard", error=RoverError)
         for name in filter(lambda name: (REPOSITORY / name).is_file(), listed.splitlines()):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(REPOSITORY / name, folder / name)
-        (folder / file).write_text(change((folder / file).read_text()))
-        yield folder
+        self._env = os.environ | {"PYTHONPATH": str(folder), "ROVER_CACHE": str(folder / ".cache")}
+        self._server = subprocess.Popen(
+            [sys.executable, "-c", SERVER], stdin=PIPE, stdout=PIPE, text=True, cwd=folder, env=self._env
+        )
+
+    def write(self, file: str, text: str) -> None:
+        """Write a file of the copy, and forget its bytecode, which may look as new as the file."""
+        (self.folder / file).write_text(text)
+        Path(cache_from_source(str(self.folder / file))).unlink(missing_ok=True)
+
+    def failed(self, options: Sequence[str]) -> str | None:
+        """Run pytest; return the first test that fails, the last option if none is named, or None.
+
+        Raises RoverError if C cannot be compiled, or a test is not there.
+        """
+        assert self._server.stdin and self._server.stdout, "they are pipes"
+        print(json.dumps([*PYTEST, *options]), file=self._server.stdin, flush=True)
+        code = int(self._server.stdout.readline())
+        printed = (self.folder / "pytest.log").read_text(errors="replace")
+        if "gcc failed" in printed or ("ERROR: not found" in printed and "ERROR collecting" not in printed):
+            raise RoverError("its tests cannot be run", found=printed[-2000:])
+        if code in (0, 5):  # 5: no test has that name
+            return None
+        match = re.search(r"^(?:FAILED|ERROR) ([^\s[]+)", printed, re.MULTILINE)
+        return match[1] if match else options[-1]
+
+    def drives_notice(self) -> bool:
+        """Return whether random drives break an invariant."""
+        return subprocess.run([sys.executable, "-c", DRIVE], cwd=self.folder, env=self._env).returncode == NOTICED
 
 
-def run_python(folder: Path, *arguments: str) -> tuple[int, str]:
-    """Run Python in a copy; return its exit code, 1 if it hangs, and its output. RoverError if C cannot be compiled."""
-    env = {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "ROVER_CACHE": str(folder / ".cache")}
-    options: dict[str, Any] = {"cwd": folder, "env": os.environ | env, "capture_output": True, "timeout": HANGS_S}
-    try:
-        done = subprocess.run([sys.executable, *arguments], text=True, errors="replace", **options)
-    except subprocess.TimeoutExpired:
-        return 1, ""
-    if "gcc failed" in (printed := done.stdout + done.stderr):
-        raise RoverError("what was planted cannot be compiled", found=printed[-2000:])
-    return done.returncode, printed
-
-
-def try_mutants(mutants: Sequence[Slip | Mutant], jobs: int, say: Callable[[str], None]) -> tuple[int, list[str]]:
+def try_mutants(mutants: Sequence[Mutant], jobs: int, say: Callable[[str], None]) -> tuple[int, list[str]]:
     """Plant each mutant in a copy and see whether a test fails; return how many were caught, and what survived.
 
     say: called with a line for each. What survivors.yml gives a reason for is not counted. A mutant that random drives
-    must notice survives if they do not. Raises RoverError if a mutant's line is not there, or if a test that failed
-    fails without mutants too.
+    must notice survives if they do not. Raises RoverError if a test that failed fails without mutants too.
     """
     reasons = {row["slip"] for row in yaml.safe_load((HERE / "survivors.yml").read_text()) or []}
-
-    def attempt(mutant: Slip | Mutant) -> tuple[str, str | None]:
-        begin_s = time.monotonic()
-        with broken_copy(mutant.file, mutant.plant) as copy:
-            failed = next(filter(None, (_failed(copy, options) for options in mutant.runs())), None)
-            unnoticed = failed and mutant.random and run_python(copy, "-c", DRIVE)[0] != NOTICED
-        name = mutant.name_in((REPOSITORY / mutant.file).read_text())
-        outcome = f"caught by {failed}" if failed else "SURVIVED"
-        outcome = "NOT noticed by random drives" if unnoticed else outcome
-        say(f"{outcome}: {name} ({time.monotonic() - begin_s:.0f} s)")
-        return name, None if unnoticed else failed
-
     with ThreadPoolExecutor(jobs) as pool:
-        outcomes = list(pool.map(attempt, mutants))
-    names = sorted({failed for _, failed in outcomes if failed})
-    with broken_copy(mutants[0].file, str) as copy:
-        for options, tests in (
-            ((), [name for name in names if "::" in name]),
-            (("--collect-only",), [name for name in names if "::" not in name]),  # could not be imported, or hung
-        ):
-            if tests and run_python(copy, *PYTEST, *options, *tests)[0]:
-                raise RoverError("tests fail without mutants too", found=" ".join(tests), remedy="make test-fast")
+        shares = pool.map(lambda share: _try_share(share, say), [mutants[i::jobs] for i in range(jobs)])
+        outcomes = list(chain.from_iterable(shares))
     survived = [name for name, failed in outcomes if not failed]
-    caught = len(outcomes) - len(survived)
     # In survivors.yml a line has no number, which changes.
-    return caught, [name for name in survived if re.sub(r":\d+:", ":", name, count=1) not in reasons]
+    unexplained = [name for name in survived if re.sub(r":\d+:", ":", name, count=1) not in reasons]
+    return len(outcomes) - len(survived), unexplained
 
 
-def _failed(copy: Path, options: Sequence[str]) -> str | None:
-    """Return the first test of such a run that fails in a copy, the run's last file if it names none, or None."""
-    code, printed = run_python(copy, *PYTEST, *options)
-    if code in (0, 5):  # 5: no test has that name
-        return None
-    match = re.search(r"^(?:FAILED|ERROR) ([^\s[]+)", printed, re.MULTILINE)
-    return match[1] if match else options[-1]
+def _try_share(mutants: Sequence[Mutant], say: Callable[[str], None]) -> list[tuple[str, str | None]]:
+    """Return each mutant's name, and the test that failed for it, if one did."""
+    outcomes = []
+    with tempfile.TemporaryDirectory(prefix="rover-mutant-") as folder:
+        bench = Bench(Path(folder))
+        for mutant in mutants:
+            begin_s = time.monotonic()
+            bench.write(mutant.file, mutant.text)
+            failed = next(filter(None, map(bench.failed, mutant.runs)), None)
+            unnoticed = failed and mutant.random and not bench.drives_notice()
+            bench.write(mutant.file, (REPOSITORY / mutant.file).read_text())
+            outcome = f"caught by {failed}" if failed else "SURVIVED"
+            outcome = "NOT noticed by random drives" if unnoticed else outcome
+            say(f"{outcome}: {mutant.name} ({time.monotonic() - begin_s:.0f} s)")
+            outcomes.append((mutant.name, None if unnoticed else failed))
+        names = sorted({failed for _, failed in outcomes if failed and "::" in failed})
+        if names and (failed := bench.failed(names)):
+            raise RoverError("a test fails without mutants too", found=failed, remedy="make test-fast")
+    return outcomes

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import shlex
 import shutil
 import subprocess
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rover_lib.cli import main
+from rover_lib.cli import main, programs
 from rover_lib.cli.prepare import Resumable
 from rover_lib.onboard.cli import show
 from rover_lib.onboard.columns import in_words
@@ -130,3 +131,13 @@ def test_benchmark_times_two_artifacts_of_one_name(artifacts, tmp_path, monkeypa
     metrics, timed = stage["metrics"], stage["metrics"]["artifacts"]
     assert {k: (v["mode"], v["n"]) for k, v in timed.items()} == {files[0]: ("static", 2), files[1]: ("mixed", 2)}
     assert (metrics["main"], metrics["threads"], stage["inputs"].keys()) == (files[0], 1, {*files})
+
+
+def test_jupyterlab_is_told_to_keep_what_widgets_show(tmp_path, monkeypatch):
+    told = {}
+    monkeypatch.setattr(programs.os, "execve", lambda program, words, environment: told.update(environment))
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "01_load.ipynb").write_text("{}")
+    programs.notebooks.callback(tmp_path / "mine", None)
+    (settings,) = Path(told["JUPYTER_CONFIG_PATH"].split(os.pathsep)[0]).rglob("*.json")
+    assert "saveState" in settings.read_text() and (tmp_path / "mine-copy" / "01_load.ipynb").exists()

@@ -198,7 +198,8 @@ def test_a_dataset_of_another_car_is_read_as_its_own(tmp_path, monkeypatch):
     assert car_of(load(tmp_path / "out").samples) == CRAWLER
     record_there_and_back(tmp_path / "mine/episode_20260101_120001", Car())
     driven(record(tmp_path / "held", frames=20), ("nobody", 0))
-    for folder, word in (("mine", "several cars"), ("held", "no two whole frames")):
+    driven(record(tmp_path / "single", frames=20), ("human", 0), ("nobody", 1))
+    for folder, word in (("mine", "several cars"), ("held", "no two whole frames"), ("single", "no two whole frames")):
         with pytest.raises(EpisodeError, match=word):
             export_dataset(tmp_path / folder, tmp_path / "new")
         assert not (tmp_path / "new").exists()

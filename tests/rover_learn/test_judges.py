@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from rover_learn.act_phases import loss_weights_of
 from rover_learn.judges import Judges, not_learned
 
 NAMES = "steering", "throttle"
@@ -52,6 +53,13 @@ def test_a_throttle_that_is_held_need_not_be_learned(throttle):
     judges = judged_by(throttle)
     assert judges.varies.tolist() == [True, False] and judges.ranges[1] == pytest.approx(0.02)
     assert not not_learned(judges.summary(np.array([1.0, 60.0])))
+
+
+def test_how_much_an_error_counts():
+    """Ranges of 2 and 0.2; a steering that spreads by half of its range counts 1 there, and a held throttle a tenth."""
+    for throttle, weights in (([0.1, 0.3, 0.1, 0.3], [1, 10]), ([0.3, 0.31, 0.3, 0.3], [1, 10])):
+        judges = judged_by(throttle)
+        assert loss_weights_of(judges, np.array([1, 0.02])).tolist() == pytest.approx(weights)
 
 
 def test_a_throttle_is_held_by_what_is_learned_from():

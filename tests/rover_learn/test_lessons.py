@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from rover_learn.lessons import ACTION, FADED, MIRRORED, STATE, Lessons
+from rover_learn.augment import GAIN
+from rover_learn.lessons import ACTION, FADED, IMAGE, MIRRORED, STATE, Lessons, lit
 from rover_learn.training import Frames
 
 STATES = np.float32([[0.5, 0], [0.25, 0]])  # too slow to be swapped for another's
@@ -14,6 +15,13 @@ STATES = np.float32([[0.5, 0], [0.25, 0]])  # too slow to be swapped for another
 def frames_of(states, size=(2, 3)):
     chunks = np.tile(np.float32([0.4, 0.1]), (len(states), 4, 1))
     return Frames((None,) * len(states), size, states, chunks, np.zeros((len(states), 4), bool), None, None)
+
+
+def test_light_by_hand():
+    """200 times 1.5 is 300, which is white and not black; 100 times 1.006 rounds up."""
+    pictures = torch.tensor([200, 100], dtype=torch.uint8).reshape(2, 1, 1, 1)
+    gain = torch.tensor([1.5, 1.006]).reshape(2, 1, 1, 1)
+    assert lit({IMAGE: pictures, GAIN: gain}).flatten().tolist() == [255, 101]
 
 
 def test_a_mirrored_view_has_its_steering_negated_and_its_throttle_not(tmp_path, monkeypatch):

@@ -26,6 +26,12 @@ def test_a_recipe_of_few_steps_keeps_all_phases(steps):
         assert abs(sum(counts) - steps) <= len(counts)
 
 
+def test_a_recipe_of_two_steps_by_hand():
+    recipe = TrainingRecipe.of("small", "cpu")
+    few = recipe.of_few(2)
+    assert (few.samples, few.judged, few.batch, few.feature_samples) == (4 * recipe.batch, 8, 2, 4)
+
+
 def test_a_gpus_recipe_is_longer_and_what_lacks_a_number_is_refused(set_params):
     set_params("train: {small: {batch: 0}}")
     assert TrainingRecipe.of("full", "cuda").transformer_steps > TrainingRecipe.of("full", "cpu").transformer_steps

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rover_learn.student import StudentShape, initial_weights, student_config
+from rover_learn.student import StudentShape, initial_weights, refit_layer, student_config
 from rover_lib.onboard.errors import CheckpointError, TrainingError
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.act_config import weight_shapes
@@ -26,6 +26,16 @@ def test_at_another_size_it_is_the_teacher(tiny):
     observations = [inputs_of(s, config) for s in memory_samples(2)]
     expected = predictions(ACT(smaller.config, smaller.weights), observations)
     assert torch.equal(predictions(ACT(config, weights), observations), expected)
+
+
+def test_a_refit_by_hand():
+    """Of inputs a, c and b, the last is left out, and is always as a is: so a takes its weight, but for the ridge."""
+    whole = torch.tensor([[3.0], [2.0], [1.0], [0.5]], dtype=torch.float64)  # of a, c, b, and the bias
+    gram = torch.diag(torch.tensor([1.0, 3.0, 1.0, 1.0], dtype=torch.float64))
+    gram[0, 2] = gram[2, 0] = 1
+    refit = refit_layer(whole, gram, torch.tensor([0, 1]))
+    ridge = 1e-4 * (1 + 3) / 2
+    assert refit.flatten().tolist() == pytest.approx([3 + 1 / (1 + ridge), 2, 0.5], abs=1e-9)
 
 
 def test_units_that_do_nothing_are_the_ones_to_go(tiny, inputs):

@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -200,6 +201,15 @@ def test_a_device_is_chosen_or_refused(monkeypatch, asked, gpus, gives):
     else:
         machine = Machine.of(asked)
         assert str(machine.device) == gives and (machine.workers > 0) == (machine.device.type == "cuda")
+
+
+def test_half_of_the_states_in_motion_are_another_moving_frames():
+    """A hundred frames stand, and the others drive, each with a steering of its own."""
+    states = np.stack([np.linspace(-1, 1, 1000), np.repeat([0.0, 0.1], [100, 900])], 1).astype(np.float32)
+    swapped = training.swap_states(SimpleNamespace(states=states), np.arange(1000), np.random.default_rng(0))
+    changed = (swapped != states).any(1)
+    assert not changed[:100].any() and 400 < changed.sum() < 500
+    assert np.isin(swapped[changed, 0], states[100:, 0]).all()
 
 
 def test_a_mirrored_sample_is_mirrored_whole():

@@ -26,6 +26,7 @@ from rover_lib.onboard.car.protocol import PROTOCOL_VERSION, Telemetry
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive.flight_log import log_limits
 from rover_lib.onboard.drive.inference import PolicyProcess
+from rover_lib.onboard.drive.motion import EVERY_S, MOVED, cells_of, difference
 from rover_lib.onboard.drive.pilot import blank, frozen
 from rover_lib.onboard.drive.plan import STOP, Settings
 from rover_lib.onboard.errors import ArtifactError, RoverError
@@ -124,13 +125,15 @@ def access(name: str, device: Path) -> Iterator[Check]:
 
 
 def camera_rate(source: Path | str, seen: tuple[int, int] | None = None, *, rate_hz: float = 30.0) -> Iterator[Check]:
-    """Measure for a second what the camera really delivers: frame rate, size, and whether anything can be seen.
+    """Measure for a second what the camera really delivers: frame rate, size, whether anything can be seen, and light.
+
+    In light that changes too much, the pictures of a stuck car look like those of a moving one. The car must stand.
 
     seen: (width, height) of the pictures that the policy was made with. Raises CameraError for another shape.
     """
     with Camera(source, rate_hz=rate_hz, size=size_like(*(seen or (16, 9)))) as camera:
-        first = _newest_after(camera, SETTLE_S)
-        last = _newest_after(camera, MEASURE_S)
+        first, _ = _watch(camera, SETTLE_S)
+        last, change = _watch(camera, MEASURE_S)
         clock = camera.time_stamps
         if seen:
             check_shape(str(source), last.image, seen)
@@ -143,20 +146,29 @@ def camera_rate(source: Path | str, seen: tuple[int, int] | None = None, *, rate
     settings = Settings.of(params()["drive"])
     if not measured_hz:
         yield Check("camera", "fail", f"{source}: no new frame within {MEASURE_S:g} s", "plug it in again")
-    elif measured_hz < RATE_SHARE * rate_hz:
-        light = "more light (long exposures halve the rate), a USB 3 port, or --hz of what it gives"
-        yield Check("camera", "warning", f"{finding}, wanted {rate_hz:g}", light)
-    elif fault := frozen(last, settings) or blank(last, settings):
+        return
+    if fault := frozen(last, settings) or blank(last, settings):
         yield Check("camera", "fail", f"{finding}, but {fault.what}", fault.remedy)
-    else:
-        yield Check("camera", "ok", finding)
+        return
+    wanted = "" if (fast := measured_hz >= RATE_SHARE * rate_hz) else f", wanted {rate_hz:g}"
+    remedy = "more light (long exposures halve the rate), a USB 3 port, or --hz of what it gives"
+    yield warn_unless(fast, "camera", finding + wanted, remedy)
+    light = f"standing pictures differ by {change:.1f}, a moving car's by over {MOVED:g}; mean {last.mean:.0f} of 255"
+    if change > MOVED:
+        light += ": a car that is stuck would not be stopped"
+    yield warn_unless(change <= MOVED, "light", light, "brighter light that does not flicker, and nothing moving in it")
 
 
-def _newest_after(camera: Any, seconds: float) -> Frame:
+def _watch(camera: Any, seconds: float) -> tuple[Frame, float]:
+    """Return the newest frame after some time, and how far the pictures were from the first, as motion.py sees it."""
     end, last = time.monotonic() + seconds, camera.latest()
+    first, seen_s, change = cells_of(last.image), last.captured_s, 0.0
     while (rest_s := end - time.monotonic()) > 0 and (frame := camera.wait(last.number, rest_s)):
         last = frame
-    return last
+        if last.captured_s - seen_s >= EVERY_S:
+            seen_s = last.captured_s
+            change = max(change, difference(cells_of(last.image), first))
+    return last, change
 
 
 def arduino(port: str) -> Iterator[Check]:

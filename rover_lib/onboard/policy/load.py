@@ -13,7 +13,7 @@ from rover_lib.onboard.artifact.manifest import ONNXRUNTIME, PACKAGES, TORCH, Ar
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import ArtifactError, PolicyError
 from rover_lib.onboard.policy.confine import refuse_root
-from rover_lib.onboard.policy.familiar import LEAST_SHARE, TOLERANCE, Familiar
+from rover_lib.onboard.policy.familiar import TOLERANCE, Familiar
 from rover_lib.onboard.policy.preprocess import prepare_frame
 
 # Each module has load(artifact, threads) -> Engine, which raises ArtifactError if it cannot run the open Artifact here.
@@ -187,14 +187,9 @@ def _check(policy: Policy, chunks: np.ndarray, strange: list[float | None], vect
     differences = dict(zip(policy.action_names, np.abs(chunks - vectors["chunk"]).max((0, 1)).tolist(), strict=True))
     tolerance = dict(policy.manifest["parity"]["tolerance"])
     if policy.familiar:
-        shares = policy.familiar.scores(vectors["embedding"]) / policy.familiar.limits
-        if not (smallest := float(shares.max(0).min())) >= LEAST_SHARE:
-            problem = f"{policy.path}: its limits of the unfamiliar are so wide that they would stop nothing"
-            raise ArtifactError(
-                problem, found=f"{smallest:.2g} of a limit in recorded pictures", remedy="quantize it again"
-            )
+        policy.familiar.check_limits(vectors["embedding"], policy.path)
         measure = "how unfamiliar a picture is, of the threshold,"
-        differences[measure] = np.abs(shares.max(1) - np.array(strange)).max()
+        differences[measure] = np.abs(policy.familiar.strange(vectors["embedding"]) - np.array(strange)).max()
         tolerance[measure] = TOLERANCE[policy.manifest["mode"] != "fp32"]
     for name, d in differences.items():
         if not d <= tolerance[name]:  # so that NaN fails too

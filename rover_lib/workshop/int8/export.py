@@ -200,6 +200,7 @@ class Exporter:
             sizes = dict(zip(("directions", "size"), familiar.directions.shape, strict=True))
             manifest["familiar"] = sizes | {"drives": described["drives"]}
             vectors |= familiar.arrays() | {"embedding": np.concatenate([outputs[i][1] for i in self.stored])}
+            familiar.check_limits(vectors["embedding"], path)
             expected_embeddings = np.concatenate([pair[1] for pair in eager])
             gap = np.abs(familiar.strange(vectors["embedding"]) - familiar.strange(expected_embeddings)).max()
             if not gap <= TOLERANCE[True]:

@@ -77,6 +77,7 @@ MANIFESTS = [
     ({"cameras": [CAMERA] * 2}, "cameras"),
     ({"cameras": [CAMERA | {"width": 256}]}, "another shape"),
     ({"state_names": ["steering\x1b[2J", "throttle"]}, "unprintable"),
+    ({"state_names": ["s" * 65, "throttle"]}, "names"),
     ({"parity": {"tolerance": {"steering": 1e9, "throttle": 0}}}, "tolerance of steering"),
     ({"parity": {"tolerance": {"steering": 0}}}, "cover"),
     ({"engine": "onnxruntime"}, "another engine"),
@@ -86,6 +87,8 @@ MANIFESTS = [
 def test_no_impossible_manifest_is_believed(artifacts, tmp_path):
     for values, message in MANIFESTS:
         refused(hostile(artifacts, tmp_path, {"manifest.json": manifest_with(**values)}), message)
+    with Artifact(hostile(artifacts, tmp_path, {"manifest.json": manifest_with(state_names=["s" * 64, "t"])})) as whole:
+        assert whole.manifest["state_names"] == ["s" * 64, "t"]
     for raw in (b"[" * 50_000, b"[]", b"\xff"):
         refused(hostile(artifacts, tmp_path, {"manifest.json": lambda _, raw=raw: raw}), "manifest is not")
 
@@ -111,6 +114,25 @@ def test_names_that_look_like_torchs_counter_are_kept_in_the_content_hash(artifa
         change = {".py": lambda raw, name=name: raw.replace(b"input", name, 1)}
         hashes.add(content_hash(rewritten(artifacts["static"], tmp_path / "other.pt", change)))
     assert len(hashes) == 4
+
+
+def test_a_content_hash_by_hand(tmp_path):
+    """By sha256sum: each name and a zero, then its record's digest, without torch's debug table, serial and counter."""
+    name, digest = "a___torch_mangle_7", "cc03aae46f5b5005576df9b369348e518410ff96e636daffe9f53ca4517d8fd2"
+    records = {
+        "archive/version": "3",
+        "archive/data.pkl": f"__torch__.{name} and x___torch_mangle_7",
+        f"archive/code/__torch__/{name}.py": f"return __torch__.{name}",
+        f"archive/code/__torch__/{name}.py.debug_pkl": "lines",
+        "archive/.data/serialization_id": "12",
+        "archive/constants.pkl": "c",
+        "archive/extra/manifest.json": "{}",
+        "archive/extra/parity.npz": "p",
+    }
+    with zipfile.ZipFile(tmp_path / "a.pt", "w") as z:
+        for record, content in records.items():
+            z.writestr(record, content)
+    assert content_hash(tmp_path / "a.pt") == digest
 
 
 def line_before_end(line: str):

@@ -45,8 +45,9 @@ class FakeCamera:
 
     time_stamps = "monotonic"
 
-    def __init__(self, hz=30.0, level=100, stops=False, repeats=0):
+    def __init__(self, hz=30.0, level=100, stops=False, repeats=0, flicker=0.0):
         self.hz, self.level, self.stops, self.repeats, self.now_s = hz, level, stops, repeats, 100.0
+        self.flicker = flicker
 
     def __call__(self, source, rate_hz, size=(640, 360)):
         self.size = size
@@ -64,6 +65,7 @@ class FakeCamera:
     def latest(self):
         number = int((100.0 if self.stops else self.now_s) * self.hz)
         image = np.full((360, 640, 3), self.level, np.uint8)
+        image[:, :320] = self.level * (1 + self.flicker * (self.now_s % 0.2 > 0.1))  # a lamp at the left
         return Frame(image, number / self.hz, number, self.repeats, float(self.level), 40.0)
 
     def wait(self, after, timeout_s):
@@ -86,12 +88,24 @@ def test_the_real_frame_rate(tmp_path, monkeypatch, camera, verdict, found):
     source.touch()
     monkeypatch.setattr(doctor, "time", camera)
     monkeypatch.setattr(doctor, "Camera", camera)
-    check = only(doctor.camera_rate(source))
+    check, *light = doctor.camera_rate(source)
+    assert [check.verdict for check in light] == ["ok"] * (verdict != "fail")
     assert check.verdict == verdict and found in check.found
     assert bool(check.remedy) == (verdict != "ok")
     with pytest.raises(CameraError):  # the policy has seen another shape than it gives
         list(doctor.camera_rate(source, (64, 48)))
     assert camera.size == (640, 480)
+
+
+def test_light_in_which_a_stuck_car_would_not_be_stopped(tmp_path, monkeypatch):
+    """The pictures change in the left half alone: by a share s of 100, the mean of both, cells differ by some 50 s."""
+    (tmp_path / "video0").touch()
+    for flicker, verdict in ((0.04, "ok"), (0.2, "warning")):
+        camera = FakeCamera(flicker=flicker)
+        monkeypatch.setattr(doctor, "time", camera)
+        monkeypatch.setattr(doctor, "Camera", camera)
+        _, light = doctor.camera_rate(tmp_path / "video0")
+        assert (light.name, light.verdict) == ("light", verdict) and "mean 100 of 255" in light.found
 
 
 def talking(receiver):

@@ -230,6 +230,14 @@ def test_a_low_supply_is_seen_whatever_the_disk_does(path, monkeypatch, quick, d
         go_on.set()
 
 
+def test_a_reading_of_the_supply_that_hangs_costs_no_line(path):
+    go_on = threading.Event()
+    host = SimpleNamespace(vcgencmd="sh", throttled=lambda: go_on.wait(10), temperature_c=lambda: 50.0)
+    log = write(path, map(tick, range(3)), host)
+    assert not log._writer.is_alive() and len(read_log(path).ticks["frame"]) == 3
+    go_on.set()
+
+
 @pytest.mark.parametrize("taken", [0, -1])
 def test_a_disk_that_takes_a_part_of_a_line(path, monkeypatch, quick, taken):
     """None is lost and none is read twice: not even of a line that lacks only its end."""

@@ -56,6 +56,13 @@ def test_a_command_at_each_absolute_deadline(link, clock):
     assert json.loads(json.dumps(report.summary()))["jitter_max_ms"] == pytest.approx(20, abs=0.1)
 
 
+def test_a_deadline_that_is_missed_is_left_out(link, clock):
+    """Work of 80 ms covers the next deadline and a third of the time to the one after it."""
+    report = go(Always({30: lambda: clock.sleep(0.08)}), link, clock, until=Until(ticks=60))
+    assert (report.ticks, report.missed) == (60, 1)
+    assert link.sent_at[-1] - link.sent_at[0] == pytest.approx(60 * PERIOD, abs=1e-6)
+
+
 def stopped_in_turn(clock, stopped_s, every_s, *, until):
     """Sleeps as a process sleeps that is stopped for a part of each turn, from a second on (SIGSTOP and SIGCONT)."""
 
@@ -157,6 +164,26 @@ def test_the_arduino_has_the_last_word(link, clock, change, match):
     with pytest.raises(DriveFault, match=match):
         go(Always({3: lambda: setattr(link, "status", replace(link.status, **change))}), link, clock)
     assert len(link.drives) == 3 and link.said[-1] == "neutral"
+
+
+@pytest.mark.parametrize(("boot", "why"), [(8, "watchdog"), (7, "unknown reason")])
+def test_why_the_arduino_was_reset(link, clock, boot, why):
+    link.hello = replace(link.hello, boot=boot, reset="watchdog")  # of the start that is meant, or the one before
+    with pytest.raises(DriveFault, match=rf"was reset \({why}\)"):
+        go(Always({3: lambda: setattr(link, "status", replace(link.status, boot=8))}), link, clock)
+
+
+def test_a_port_that_is_stuck_is_said_once(link, clock):
+    log, whole, calls = Log(), link.send, iter(range(100))
+
+    def send(*pulses):
+        if next(calls) in (0, 1):  # the first two
+            raise LinkError("stuck")
+        return whole(*pulses)
+
+    link.send = send
+    go(Always(), link, clock, log, until=Until(ticks=20))
+    assert len([text for text in log.events if "a command was not sent: stuck" in str(text)]) == 1
 
 
 def test_what_was_not_acknowledged_is_sent_again(clock):

@@ -27,6 +27,7 @@ def test_one_picture_drives_for_a_metre_at_most(fade_s, stop_s):
     """With a minute each, a policy of 5 Hz and 256 actions, one picture drove for 51 s."""
     with pytest.raises(ParamsError, match=r"by one picture the car would go [\d.]+ m at 1.1 m/s, and it may 1"):
         Settings(fade_s=fade_s, stop_s=stop_s)
+    Settings(fade_s=1 / 1.1, stop_s=1 / 1.1)  # a metre
 
 
 def test_a_plan_is_used_by_time():

@@ -113,9 +113,12 @@ def test_plans_stay_and_each_engine_and_mode_tells_the_same(made):
 
 
 WIDE = {"wide": [1e30, 1e30], "one": [1.0, 1e30], "negative": [-1.0, -1.0], "zero": [0.0, 1.0]}
+SO_WIDE = 6  # times as wide as they were made
 
 
-@pytest.mark.parametrize("change", ["embedding", "mean", "limits", "shape", "sizes", "unclaimed", "spread", *WIDE])
+@pytest.mark.parametrize(
+    "change", ["embedding", "mean", "limits", "shape", "sizes", "unclaimed", "spread", "wider", *WIDE]
+)
 def test_a_false_claim_of_what_is_familiar_is_refused(made, tmp_path, monkeypatch, change):
     with Artifact(made / "policy_fp32.onnx.zip") as whole:
         manifest, vectors, model = dict(whole.manifest), dict(whole.parity), whole.record(artifact.ONNX)
@@ -125,6 +128,7 @@ def test_a_false_claim_of_what_is_familiar_is_refused(made, tmp_path, monkeypatc
         "limits": {"familiar_limits": np.ones(3, np.float32)},
         "shape": {"familiar_directions": vectors["familiar_directions"].T},
         "spread": {"familiar_spread": -vectors["familiar_spread"]},
+        "wider": {"familiar_limits": SO_WIDE * vectors["familiar_limits"]},
         **{name: {"familiar_limits": np.array(limits, np.float32)} for name, limits in WIDE.items()},
     }
     if change == "sizes":
@@ -146,6 +150,11 @@ def test_scores_by_hand():
     embedding = np.float32([[4, 9, 12]])  # from the mean 3, 8 and 12: 6 and 4 standard deviations, and 12 left over
     assert familiar.scores(embedding) == pytest.approx(np.array([[np.sqrt((36 + 16) / 2), 12.0]]))
     assert familiar.strange(embedding) == pytest.approx([np.sqrt(26) / 4])  # 1.27 of the first limit, 1.2 of the other
+    familiar.check_limits(embedding, "")
+    for limits in ([4, 81], [35, 10]):  # of which they reach 12 / 81 and 5.1 / 35, less than 0.15
+        familiar.limits = np.float32(limits)
+        with pytest.raises(ArtifactError, match=r"0\.15 of a limit"):
+            familiar.check_limits(embedding, "")
 
 
 def test_a_fit_by_hand():

@@ -287,10 +287,13 @@ def test_an_observers_range_is_within_what_it_saw(batches, choice):
     assert scale >= SMALLEST_SCALE and -128 <= zero <= 127
 
 
-def test_the_least_squares_range_is_the_best_of_all_pairs():
-    """By the definition: of each pair of ends, the error of every value that is rounded or clipped."""
+@pytest.mark.parametrize("positive", [False, True])
+def test_the_least_squares_range_is_the_best_of_all_pairs(positive):
+    """By the definition: of each pair of ends around 0, the error of every value that is rounded or clipped."""
     o = RangeObserver(choice="histogram")
-    o(torch.from_numpy(np.random.default_rng(0).laplace(size=100_000).astype(np.float32)))
+    rng = np.random.default_rng(0)
+    values = 0.95 + 0.01 * np.abs(rng.standard_t(3, 100_000)) if positive else rng.laplace(size=100_000)
+    o(torch.from_numpy(values.astype(np.float32)))
     x, weight = o._centres().double(), (o.histogram / o.histogram.sum()).double()
 
     def error(low, high):
@@ -298,7 +301,7 @@ def test_the_least_squares_range_is_the_best_of_all_pairs():
         return ((high - low) / 255) ** 2 / 12 + float(clipped**2 @ weight)
 
     shares = np.linspace(1, 0.1, 31)
-    pairs = [(o.min_val.item() * a, o.max_val.item() * b) for a in shares for b in shares]
+    pairs = [(min(o.min_val.item() * a, 0), o.max_val.item() * b) for a in shares for b in shares]
     assert o.range() == pytest.approx(min(pairs, key=lambda pair: error(*pair)), rel=1e-6)
     assert o.range()[1] < 0.9 * o.max_val.item(), "it clips what is rare"
 
@@ -336,6 +339,18 @@ def test_an_artifact_says_what_it_is(tiny, calibration, tmp_path):
     Exporter(tiny, memory_samples(2)).export(ACT(tiny.config, tiny.weights), tmp_path / "b.pt")
     assert "car" not in read_manifest(tmp_path / "b.pt")
     assert read_manifest(tmp_path / "b.pt")["parity"]["tolerance"]["steering"] == pytest.approx(1e-4)
+
+
+def test_a_tolerance_by_hand(tiny):
+    """FP32's grows with an action beyond 1; INT8's is so many times its largest error, and never less than FP32's."""
+    exporter = Exporter(tiny, memory_samples(2))
+    exporter.parity = {"vectors": 2, "fp32": 0.001, "int8_errors": 3}
+    exporter.float_actions = torch.tensor([[[0.5, 40.0]], [[-0.5, 20.0]]])
+    actions = exporter.float_actions + torch.tensor([[[0.1, 0.01]], [[-0.2, 0.0]]])
+    for policy, wanted in ((exporter.float_policy, [0.001, 0.04001]), (off_by(tiny, 0, 0), [0.6, 0.04001])):
+        found = exporter._tolerance(policy, actions, np.array([0, 1]))
+        assert [*found.values()] == pytest.approx(wanted, rel=1e-4)
+    assert exporter._tolerance(policy, actions[1:], np.array([1]))["throttle"] == pytest.approx(0.02)
 
 
 def test_a_badly_written_graph_sets_no_tolerance_for_itself(tiny, calibration, tmp_path, monkeypatch):

@@ -66,8 +66,14 @@ def test_drives_of_seconds_and_many_of_them_are_parted_whole():
     assert not name_blocks([drive(87)])[1]
 
 
+@pytest.mark.parametrize(("frames", "count"), [(255, 0), (256, 8), (767, 8), (768, 12), (14135, 32), (40000, 67)])
+def test_how_many_blocks_by_hand(frames, count):
+    """A plan takes 1.6 s, eight 12.8 s and two times twelve 38.4 s; 707 s are 32 times 22 s, 2,000 s 67 times 30."""
+    assert len(name_blocks([drive(frames)])[1]) == count
+
+
 @pytest.mark.parametrize(
-    ("found_hz", "kept_hz"), [(19.97, 20), (24.5, 24.5), (29.6, 30), (4.348, 4.348), (15.4, 15.4), (0.3, 0.3)]
+    ("found_hz", "kept_hz"), [(19.97, 20), (24.5, 24.5), (4.348, 4.348), (15.4, 15.4), (0.99, 1), (0.3, 0.3)]
 )
 def test_a_rate_is_rounded_only_as_far_as_no_plan_notices(found_hz, kept_hz):
     assert round_rate_hz(found_hz) == kept_hz

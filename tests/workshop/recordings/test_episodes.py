@@ -15,7 +15,7 @@ import simplejpeg
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.workshop.recordings.controls import _refuse_other_pulses
-from rover_lib.workshop.recordings.episodes import choose_calibration, split
+from rover_lib.workshop.recordings.episodes import choose_calibration, load_recordings, split
 from tests.helpers import hostile
 from tests.helpers.episodes import (
     CHUNK,
@@ -468,10 +468,15 @@ def test_paths_that_leave_the_folder(tmp_path):
 @pytest.mark.parametrize("make", [lambda root: None, lambda root: root.write_text("x"), lambda root: root.mkdir()])
 def test_no_recordings_is_one_sentence(tmp_path, make):
     make(tmp_path / "episodes")
-    for options in ({}, {"chunk": 0}, {"sync_s": math.nan}):
+    for options in ({}, {"chunk": 0}, {"sync_s": math.nan}, {"sync_s": 0.0}):
         with pytest.raises(EpisodeError) as e:
             load(tmp_path / "episodes", **options)
-        assert "\n" not in str(e.value)
+        assert "\n" not in str(e.value) and ("sync_s above 0" in str(e.value)) == bool(options)
+
+
+def test_the_folder_in_which_one_stands_names_its_episode(tmp_path, monkeypatch):
+    monkeypatch.chdir(record(tmp_path))
+    assert load(".").episodes[0].id == "episode_20260101_120000"
 
 
 # ---- splitting and choosing ------------------------------------------------------------------------------
@@ -507,7 +512,11 @@ def test_few_episodes_are_parted_along_time_with_a_gap(tmp_path):
         for before, after in pairwise(times):
             # A chunk's last action is (CHUNK - 1) frames after its frame, so no action is shared.
             assert min(after) - max(before) > (CHUNK - 0.5) / 30
-    assert len(parts.calibration) > len(parts.choosing) + len(parts.held_out)
+        # Without two gaps of 8, 44 of 60 frames are left, and 11 of these are held out: 5 choose, 6 judge.
+        assert [len(part) for part in times] == [33, 5, 6]
+    assert load_recordings(tmp_path).samples[0].chunk.shape == (32, 2)
+    smallest = split(load(record(tmp_path / "smallest", frames=2 * CHUNK + 3)))
+    assert [len(smallest.calibration), len(smallest.choosing), len(smallest.held_out)] == [1, 1, 1]
     with pytest.raises(EpisodeError, match="too short to be parted"):
         split(load(record(tmp_path / "short", frames=2 * CHUNK)))
 
