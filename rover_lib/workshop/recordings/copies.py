@@ -100,6 +100,12 @@ def _is_same(a: np.ndarray, b: np.ndarray) -> bool:
     return float((a * b).sum()) > CORRELATED * float(np.linalg.norm(a) * np.linalg.norm(b))
 
 
+def pictures_change(episode: Episode) -> bool:
+    """Whether some pictures of an episode differ."""
+    first, *others = (scaled_down(sample) for sample in pick_evenly(episode.samples, COMPARED))
+    return not all(_is_same(first, other) for other in others)
+
+
 def scaled_down(sample: Sample) -> np.ndarray:
     """The picture in few pixels; of several cameras, one beside the other."""
     frames = by_camera(sample.frame_bgr(SEEN[0]), "").values()

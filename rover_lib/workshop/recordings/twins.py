@@ -26,6 +26,8 @@ def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episo
         as_it_is = how == how_other == ""
         if first is second or left_out & {first, second} or (how and how_other):
             continue
+        if "backwards" in how + how_other and not copies.pictures_change(first):
+            continue  # of a picture that stands still nothing says which way it goes
         if as_it_is or "mirrored" not in how + how_other or not _is_symmetric(first):
             left_out.add(second)
             note = f"the same drive as {first.id}{how or how_other}, as its actions and pictures show"
