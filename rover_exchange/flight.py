@@ -76,7 +76,8 @@ def _draw_pulses(ax: Axes, channel: Channel, ticks: Mapping[str, np.ndarray], co
     ax.plot(t_s, pins, color=BLACK, lw=0.9, label="the Arduino's pin", drawstyle="steps-post")
     ax.axhline(neutral_us, color=GREY, lw=0.8, ls="--", label=f"neutral, {neutral_us} us")
     pulses = np.concatenate([commanded, pins, [neutral_us]])
-    low, high = np.nanmin(pulses), np.nanmax(pulses)
+    low = np.nanmin(pulses)
+    high = np.nanmax(pulses)
     room = max(0.08 * (high - low), 6)  # or the noise of a standing car would fill the panel
     ax.set_ylim(low - room, high + room)
     scale = (lambda us: (us - neutral_us) / channel.us_per_unit, lambda a: neutral_us + a * channel.us_per_unit)

@@ -173,7 +173,8 @@ def run_drive(json_file: Path | None, car: Any = None, **options: Any) -> int:
     o = DriveOptions(**options, asked_s=asked_s)
     if o.service and o.dry_run:
         raise click.UsageError("--service drives a car: no --dry-run")
-    report, code = Report(), 0
+    report = Report()
+    code = 0
     try:
         drive_car(o, report, car)
     except RoverError as e:

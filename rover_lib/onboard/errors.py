@@ -27,7 +27,10 @@ class RoverError(Exception):
 
     def __init__(self, what: str, *, found: object = None, remedy: str = "", kind: str = ""):
         super().__init__(what)
-        self.what, self.found, self.remedy, self.kind = what, found, remedy, kind
+        self.what = what
+        self.found = found
+        self.remedy = remedy
+        self.kind = kind
 
     def __str__(self) -> str:
         text = self.what

@@ -113,7 +113,8 @@ class Output(click.Path):
 
     def __init__(self, kind: str | None = None, *, appended: bool = False):
         super().__init__(path_type=Path)
-        self.kind, self.appended = kind, appended
+        self.kind = kind
+        self.appended = appended
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         path = Path(str(super().convert(value, param, ctx)))

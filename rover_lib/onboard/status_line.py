@@ -22,7 +22,8 @@ class StatusLine(logging.Handler):
 
     def __init__(self, callback: Callable[[], str]):
         super().__init__()
-        self._callback, self._terminal = callback, sys.stderr.isatty()
+        self._callback = callback
+        self._terminal = sys.stderr.isatty()
         self._every_s = EVERY_S if self._terminal else PLAIN_EVERY_S
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()  # None: the end
         self._thread = threading.Thread(target=self._run, name="status line", daemon=True)

@@ -66,7 +66,8 @@ class Weights:
     """The tensors of a checkpoint whose names begin with one prefix, as float32."""
 
     def __init__(self, tensors: dict[str, Tensor], prefix: str = ""):
-        self.tensors, self.prefix = tensors, prefix
+        self.tensors = tensors
+        self.prefix = prefix
 
     def __getitem__(self, name: str) -> Tensor:
         return self.tensors[self.prefix + name].float()

@@ -29,7 +29,8 @@ def explain_state(states: np.ndarray, actions: np.ndarray, names: Sequence[str])
     """Say what an episode's states are, if they are not the action before; empty if they are. Both are (n, A)."""
     names_by_words: dict[str, list[str]] = {}
     if len(states) > LEAST_ROWS and np.isfinite(states).all() and np.isfinite(actions).all():
-        states, actions = states.astype(float), actions.astype(float)
+        states = states.astype(float)
+        actions = actions.astype(float)
         for i, name in enumerate(names):
             words = _explain(states[:, i], actions[:, i])
             for j, other in enumerate(names if words == FOLLOWS_NONE else ()):

@@ -45,7 +45,8 @@ class Expected:
 
 
 def _refuse_engine(manifest: dict[str, Any]) -> dict[str, str]:
-    engine, made_with = manifest["engine"], str(manifest["versions"].get("torch", "?"))
+    engine = manifest["engine"]
+    made_with = str(manifest["versions"].get("torch", "?"))
     if engine not in PACKAGES:
         return {"engine": f"it needs the engine '{engine}', rovers have {' or '.join(PACKAGES)}"}
     here = version_of(PACKAGES[engine])

@@ -74,7 +74,9 @@ def _check_directory(file: BinaryIO, path: Path | str) -> None:
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - 98))
     tail = file.read()
-    end, locator, end64 = tail[-22:], tail[-42:-22], tail[:-42]
+    end = tail[-22:]
+    locator = tail[-42:-22]
+    end64 = tail[:-42]
     if end[:4] != b"PK\5\6" or end[20:] != b"\0\0":
         raise zipfile.BadZipFile("it does not end as an archive")
     records, length, start = struct.unpack("<10xHII2x", end)
@@ -92,7 +94,8 @@ def _check_directory(file: BinaryIO, path: Path | str) -> None:
 
 
 def _check_records(records: list[zipfile.ZipInfo], path: Path | str) -> None:
-    names, total = set(), 0
+    names = set()
+    total = 0
     for record in records:
         name = record.filename.removeprefix("archive/")
         if name == ".data/version":  # torch moves it there if the program has an operator that changed, as gelu did

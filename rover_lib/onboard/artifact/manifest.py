@@ -280,7 +280,8 @@ def shapes_of_familiar(manifest: Mapping[str, Any]) -> dict[str, tuple[int, ...]
     """Return the shapes of the arrays that tell what is familiar, by their names in parity.npz; none without them."""
     if not (familiar := manifest.get("familiar")):
         return {}
-    size, directions = familiar["size"], familiar["directions"]
+    size = familiar["size"]
+    directions = familiar["directions"]
     return {
         "familiar_mean": (size,),
         "familiar_directions": (directions, size),

@@ -104,7 +104,8 @@ class Camera:
         clock: Callable[[], float] = time.monotonic,
     ):
         self.source = str(source)
-        self.size, self.wanted_hz = size, rate_hz
+        self.size = size
+        self.wanted_hz = rate_hz
         self._clock = clock
         self.time_stamps = NO_CLOCK  # their clock; NO_CLOCK: frames get their time of arrival
         self._stamp_s = float("-inf")  # the newest one
@@ -241,7 +242,8 @@ class Camera:
         repeats = before.repeats + 1 if before and same >= SAME else 0
         frame = Frame(image, captured_s, number, repeats, *brightness(image), jpeg)
         with self._changed:
-            self._frame, self._arrived_s = frame, self._clock()
+            self._frame = frame
+            self._arrived_s = self._clock()
             self._changed.notify_all()
 
 

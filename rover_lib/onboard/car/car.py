@@ -60,13 +60,17 @@ class Car:
     human: str = "receiver"
 
     def __post_init__(self) -> None:
-        steering, throttle = self.pwm.steering, self.pwm.throttle
-        neutral_us, forward_us = throttle.neutral_us, throttle.pulse_us(throttle.high)
-        periods, pulses = (PERIOD_MIN_US, PERIOD_MAX_US), (PULSE_MIN_US, PULSE_MAX_US)
+        steering = self.pwm.steering
+        throttle = self.pwm.throttle
+        neutral_us = throttle.neutral_us
+        forward_us = throttle.pulse_us(throttle.high)
+        periods = (PERIOD_MIN_US, PERIOD_MAX_US)
+        pulses = (PULSE_MIN_US, PULSE_MAX_US)
         neutrals = THROTTLE_NEUTRAL_MIN_US, NEUTRAL_MAX_US
         if throttle.period_us < PERIOD_MIN_US:  # a fast one, which goes forward only
             periods = FAST_PERIOD_MIN_US, FAST_PERIOD_MAX_US
-            neutrals, pulses = (FAST_NEUTRAL_MIN_US, FAST_NEUTRAL_MAX_US), (neutral_us, FAST_PULSE_MAX_US)
+            neutrals = (FAST_NEUTRAL_MIN_US, FAST_NEUTRAL_MAX_US)
+            pulses = (neutral_us, FAST_PULSE_MAX_US)
         throw_us = min(abs(end - steering.neutral_us) for end in steering.ends_us)
         limits: list[tuple[str, float, float, float]] = [
             ("steering's period_us", steering.period_us, PERIOD_MIN_US, PERIOD_MAX_US),
@@ -137,7 +141,8 @@ class Car:
     @property
     def pulses_us(self) -> tuple[int, ...]:
         """Of steering and then of throttle: the period, and the pulses of the lowest action, 0 and the highest; us."""
-        steering, throttle = self.pwm.steering, self.pwm.throttle
+        steering = self.pwm.steering
+        throttle = self.pwm.throttle
         return round(steering.period_us), *steering.pulses_us, round(throttle.period_us), *throttle.pulses_us
 
     def description(self) -> dict[str, Any]:
@@ -230,7 +235,8 @@ def _channel(name: str, period_us: int, pulses_us: tuple[int | None, int, int]) 
         pulses = f"{low_us}, {neutral_us} and {high_us}"
         problem = f"{name}'s neutral_us must lie between its two ends"
         raise CarError(problem, found=pulses, remedy="measure them with `rover calibrate`")
-    neutral_pct, high_pct = neutral_us / period_us * 100, (high_us - neutral_us) / period_us * 100
+    neutral_pct = neutral_us / period_us * 100
+    high_pct = (high_us - neutral_us) / period_us * 100
     if low_us is None:
         return Channel(name, period_us, neutral_pct, high_pct, 0.0, 1.0, by_pulse=True)
     low_pct = (neutral_us - low_us) / period_us * 100

@@ -57,8 +57,11 @@ class Gamepad:
     """
 
     def __init__(self, name: str, pad: int, motion: int, identity: str = "", read: ReadStick = read_stick):
-        self.name, self.identity = name, identity
-        self._pad, self._motion, self._read_stick = pad, motion, read
+        self.name = name
+        self.identity = identity
+        self._pad = pad
+        self._motion = motion
+        self._read_stick = read
         self._values: dict[int, float] = {}  # of each stick that is known
         self._ranges: dict[int, tuple[int, int]] = {}
         self._held = False
@@ -125,7 +128,8 @@ class Gamepad:
     def _take(self, kind: int, code: int, value: int, *, young: bool) -> None:
         """Take an event of the sticks. young: it has not waited, so that a press of L1 is one of now."""
         if kind == SYN and code == DROPPED:
-            self._lost, self._held = True, False
+            self._lost = True
+            self._held = False
             self._values.clear()
         elif self._lost:
             if kind == SYN:
@@ -185,7 +189,8 @@ def list_gamepads(dev: Path = Path("/dev/input"), sys: Path = Path("/sys/class/i
     both_axes = 1 << STEERING | 1 << THROTTLE
     gamepads = []
     for node in nodes:
-        axes, keys = bits(node, "capabilities/abs"), bits(node, "capabilities/key")
+        axes = bits(node, "capabilities/abs")
+        keys = bits(node, "capabilities/key")
         if axes & both_axes == both_axes and keys >> BTN_L1 & 1:
             name = ascii(text(node, "name"))[1:-1][:60]
             identity = f"{name} {text(node, 'uniq') or text(node, 'phys')}"

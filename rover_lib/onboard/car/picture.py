@@ -69,7 +69,8 @@ def _decode(data: bytes, colours: str, **scale: int) -> np.ndarray:
 
 def _is_turned(data: bytes) -> bool:
     """Whether most programs show a picture turned, while decoders do not turn it."""
-    encoded, flags = np.frombuffer(data, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8
+    encoded = np.frombuffer(data, np.uint8)
+    flags = cv2.IMREAD_REDUCED_GRAYSCALE_8
     upright, plain = (np.asarray(cv2.imdecode(encoded, flags | more)) for more in (0, cv2.IMREAD_IGNORE_ORIENTATION))
     return not np.array_equal(upright, plain)
 
@@ -81,7 +82,8 @@ def _check_only_filler(data: bytes, warning: ValueError) -> bytes:
     interval is decoded as a picture of its own, where a warning about filler is the last one.
     """
     segments, scan_at = _segments(data)
-    header, scanned = b"\xff\xd8" + b"".join(segments), data[scan_at:]
+    header = b"\xff\xd8" + b"".join(segments)
+    scanned = data[scan_at:]
     data, filled = header + scanned, data[:scan_at]
     if header != filled:
         try:
@@ -94,7 +96,8 @@ def _check_only_filler(data: bytes, warning: ValueError) -> bytes:
         return data  # nothing follows it
     if not ("extraneous bytes" in str(warning) and {RESTART_INTERVAL, BASELINE} <= named.keys()):
         raise warning
-    interval, frame = int.from_bytes(named[RESTART_INTERVAL][4:6], "big"), named[BASELINE]
+    interval = int.from_bytes(named[RESTART_INTERVAL][4:6], "big")
+    frame = named[BASELINE]
     height, width, parts = struct.unpack(">HHB", frame[5:10])
     sampling = frame[11::3] if parts > 1 else b"\x11"  # horizontal and vertical, four bits each
     block = 8 * max(s >> 4 for s in sampling), 8 * max(s & 15 for s in sampling)
@@ -127,7 +130,8 @@ def _segments(data: bytes) -> tuple[list[bytes], int]:
 
     Filler between them is left out.
     """
-    at, segments = 2, [b"  "]
+    at = 2
+    segments = [b"  "]
     while segments[-1][1] != SCAN:
         filled = data.find(b"\xff", at, at + FILLED_MOST + 1)
         at = max(at, filled)
@@ -163,7 +167,8 @@ def block_sums(image: np.ndarray) -> np.ndarray:
     image: contiguous, and at least LEAST in size.
     """
     height, width = image.shape[:2]
-    rows, words = height // ROWS, width * 3 // 8 // COLUMNS
+    rows = height // ROWS
+    words = width * 3 // 8 // COLUMNS
     lines = image.reshape(height, width * 3)[: rows * ROWS, : words * COLUMNS * 8]
     eights = np.ascontiguousarray(lines).view(np.uint64)  # eight bytes at a time; overflow does not matter
     return eights.reshape(ROWS, rows, -1).sum(1).reshape(ROWS, COLUMNS, words).sum(2).ravel()

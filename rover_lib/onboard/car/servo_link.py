@@ -146,7 +146,8 @@ class ServoLink:
     def _wait_for_hello(self) -> Hello:
         self._asked = opened = self._clock()
         while not (hello := self._await(lambda: self.hello, REPEAT_S)):
-            now, running = self._clock(), self._telemetry
+            now = self._clock()
+            running = self._telemetry
             if now - opened > BOOT_S:
                 flash = f"make -C firmware flash PORT={shlex.quote(str(self.port))}"
                 remedy = f"is it the rover's, and is the firmware on it ({flash})?"
@@ -157,9 +158,11 @@ class ServoLink:
             if now - opened > due and now - self._asked > HELLO_EVERY_S / 2:
                 self._asked = now
                 self._write(frame(">Q"))
-        build, make = FIRMWARE_VERSION, "make -C firmware flash"
+        build = FIRMWARE_VERSION
+        make = "make -C firmware flash"
         if self.car.human == "gamepad":
-            build, make = f"{build}-gamepad", f"{make} HUMAN=gamepad"
+            build = f"{build}-gamepad"
+            make = f"{make} HUMAN=gamepad"
         if (hello.protocol, hello.firmware) != (PROTOCOL_VERSION, build):
             problem = f"{self.port}: the Arduino must have firmware {build} (protocol {PROTOCOL_VERSION})"
             actual = f"{hello.firmware} (protocol {hello.protocol})"
@@ -178,7 +181,8 @@ class ServoLink:
 
     def tell(self, car: Car) -> None:
         """Make the Arduino drive its pins for this car from now on. Raises LinkError if it refuses the car."""
-        self.car, self.calibration = car, car.pwm
+        self.car = car
+        self.calibration = car.pwm
         if hello := self.hello:
             self._tell_car(replace(hello, car=0))
 
@@ -210,7 +214,8 @@ class ServoLink:
 
     def _release(self) -> None:
         self._closing.set()
-        port, self._serial = self._serial, None
+        port = self._serial
+        self._serial = None
         if port:
             with contextlib.suppress(*PORT_ERRORS, AttributeError):
                 port.cancel_read()
@@ -345,7 +350,8 @@ class ServoLink:
 
     def round_trip_s(self) -> float:
         """Ask for a hello, and return the seconds until it came. Raises LinkError if none comes within 0.5 s."""
-        before, start = self.hello, self._clock()
+        before = self.hello
+        start = self._clock()
         self._write(frame(">Q"))
         if not self._await(lambda: self.hello is not before, ANSWER_S):
             raise self._no_answer("a question")
@@ -398,7 +404,8 @@ class ServoLink:
 
     def _read(self, port: serial.Serial) -> None:
         """Drain the port as fast as it fills. The reader thread runs this."""
-        pending, skipping = b"", False
+        pending = b""
+        skipping = False
         while not self._closing.is_set():
             try:
                 data = port.read(max(1, port.in_waiting))
@@ -415,7 +422,8 @@ class ServoLink:
             if self._gamepad and lines:
                 self._relay(self._gamepad, now)
             if len(pending) > LINE_MAX:
-                pending, skipping = b"", True
+                pending = b""
+                skipping = True
                 self.garbled += 1
 
     def _relay(self, gamepad: Gamepad, now: float) -> None:
@@ -444,7 +452,8 @@ class ServoLink:
         if isinstance(message, Hello):
             with self._sending:
                 if not self.hello or message.boot != self._boot:
-                    self._boot, self._sequence = message.boot, message.sequence
+                    self._boot = message.boot
+                    self._sequence = message.sequence
         elif self.hello and message.boot != self._boot and now - self._asked > HELLO_EVERY_S:
             self._asked = now  # it was reset, and the hello of its new start was lost
             with contextlib.suppress(LinkError):

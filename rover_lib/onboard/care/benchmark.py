@@ -113,7 +113,8 @@ def describe_clock(over_time: Sequence[Mapping[str, Any]]) -> str:
 
 def _time_artifacts(paths: dict[str, str], threads: int, options: dict[str, Any]) -> dict[str, Any]:
     policies, artifacts = load_confined(paths, threads=threads)
-    cameras, vectors = next(iter(policies.values())).cameras, next(iter(artifacts.values())).parity
+    cameras = next(iter(policies.values())).cameras
+    vectors = next(iter(artifacts.values())).parity
     frames = []
     for i in range(len(vectors["state"])):  # stored as RGB; a camera gives BGR
         frames.append({camera: vectors[f"frame_{camera}"][i][:, :, ::-1] for camera in cameras})
@@ -227,7 +228,10 @@ class _Run:
     """The timed part of one benchmark."""
 
     def __init__(self, timing: Timing, host: Host, wall: Callable[[], float], cpu: Callable[[], float]):
-        self.timing, self.host, self.wall, self.cpu = timing, host, wall, cpu
+        self.timing = timing
+        self.host = host
+        self.wall = wall
+        self.cpu = cpu
         self.latencies_ms: dict[str, list[float]] = {name: [] for name in timing.policies}
         self.readings: list[dict[str, Any]] = []
         self.begun_s: list[float] = []  # each round's start, since start_s
@@ -236,10 +240,12 @@ class _Run:
 
     def measure(self, rounds: Iterable[int]) -> None:
         """Time the rounds, or as many as begin within at_most_s, and fill the lists."""
-        timing, names = self.timing, list(self.timing.policies)
+        timing = self.timing
+        names = list(self.timing.policies)
         at_most_s = 60 * timing.minutes if timing.minutes else timing.at_most_s
         before = self.host.core_ticks()
-        cpu_start_s, self.start_s = self.cpu(), self.wall()
+        cpu_start_s = self.cpu()
+        self.start_s = self.wall()
         read_s = -math.inf
         for i in rounds:
             passed_s = self.wall() - self.start_s
@@ -255,7 +261,8 @@ class _Run:
                 begin_s = self.wall()
                 timing.policies[name].predict_chunk(frame, timing.state)
                 self.latencies_ms[name].append((self.wall() - begin_s) * 1000)
-        self.wall_s, self.process_s = self.wall() - self.start_s, self.cpu() - cpu_start_s
+        self.wall_s = self.wall() - self.start_s
+        self.process_s = self.cpu() - cpu_start_s
         self._read_host(self.wall_s)
         after = self.host.core_ticks()
         if before and after and len(before) == len(after):
@@ -269,10 +276,12 @@ class _Run:
         """
         policy = self.timing.policies[name]
         times_ms = np.asarray(self.latencies_ms[name], float)
-        mean_ms, p95_ms = float(times_ms.mean()), float(np.percentile(times_ms, 95))
+        mean_ms = float(times_ms.mean())
+        p95_ms = float(np.percentile(times_ms, 95))
         manifest = getattr(policy, "manifest", None) or {}
         path = getattr(policy, "path", None)
-        mode, gmac = manifest.get("mode"), manifest.get("gmac")
+        mode = manifest.get("mode")
+        gmac = manifest.get("gmac")
         return {
             **{f"latency_{name}_ms": float(np.percentile(times_ms, q)) for name, q in PERCENTILES.items()},
             "latency_min_ms": float(times_ms.min()),
@@ -293,7 +302,8 @@ class _Run:
         if not self.timing.reference:
             return {}
         times_ms, reference_ms = (np.asarray(self.latencies_ms[n]) for n in (name, self.timing.reference))
-        p50_ms, reference_p50_ms = float(np.median(times_ms)), float(np.median(reference_ms))
+        p50_ms = float(np.median(times_ms))
+        reference_p50_ms = float(np.median(reference_ms))
         low, high = np.percentile(reference_ms / times_ms, (5, 95)).tolist()
         return {"speedup": reference_p50_ms / p50_ms, "speedup_p5": low, "speedup_p95": high}
 

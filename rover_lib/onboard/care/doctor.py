@@ -116,7 +116,8 @@ def access(name: str, device: Path) -> Iterator[Check]:
     """Check whether this user may use the device, if it is there; another check reports a missing one."""
     if not device.exists():
         return
-    user, group = getpass.getuser(), device.group()
+    user = getpass.getuser()
+    group = device.group()
     remedy = f"sudo usermod -aG {group} {user}, then log in again (or restart the service)"
     if os.access(device, os.R_OK | os.W_OK):
         yield Check(name, "ok", f"{user} may use {device}")
@@ -161,8 +162,11 @@ def camera_rate(source: Path | str, seen: tuple[int, int] | None = None, *, rate
 
 def _watch(camera: Any, seconds: float) -> tuple[Frame, float]:
     """Return the newest frame after some time, and how far the pictures were from the first, as motion.py sees it."""
-    end, last = time.monotonic() + seconds, camera.latest()
-    first, seen_s, change = cells_of(last.image), last.captured_s, 0.0
+    end = time.monotonic() + seconds
+    last = camera.latest()
+    first = cells_of(last.image)
+    seen_s = last.captured_s
+    change = 0.0
     while (rest_s := end - time.monotonic()) > 0 and (frame := camera.wait(last.number, rest_s)):
         last = frame
         if last.captured_s - seen_s >= EVERY_S:
@@ -177,7 +181,8 @@ def arduino(port: str) -> Iterator[Check]:
         firmware = link.hello.firmware if link.hello else "unknown"
         yield Check("Arduino", "ok", f"{port}: firmware {firmware}, protocol {PROTOCOL_VERSION}")
         times_ms = [link.round_trip_s() * 1000 for _ in range(ROUND_TRIPS)]
-        median_ms, most_ms = statistics.median(times_ms), max(times_ms)
+        median_ms = statistics.median(times_ms)
+        most_ms = max(times_ms)
         finding = f"round trip {median_ms:.1f} ms median, {most_ms:.1f} ms at most of {ROUND_TRIPS}"
         if link.garbled:
             finding += f"; {link.garbled} lines were garbled"
@@ -236,7 +241,8 @@ def _soon(link: ServoLink, condition: Callable[[Telemetry], bool], seconds: floa
 
 
 def _failsafe(after: tuple[int | None, ...], rest_us: int) -> Check:
-    name, remedy = "failsafe", "set the receiver's failsafe to no pulses (its manual says how), then run this again"
+    name = "failsafe"
+    remedy = "set the receiver's failsafe to no pulses (its manual says how), then run this again"
     if None in after:
         return Check(name, "ok", "without its transmitter the receiver sends no pulses: the car stops within 100 ms")
     steering_us, throttle_us = (us or 0 for us in after)
@@ -251,7 +257,8 @@ def car(manifest: dict[str, Any] | None = None) -> Iterator[Check]:
 
     manifest: the artifact's. Raises CarError for a bad car.yml or gamepad.
     """
-    this, path = this_car(), car_file()
+    this = this_car()
+    path = car_file()
     yield Check("car", "ok", f"{this.name}, of {path}" if path else f"{this.name}: no car.yml is here")
     if this.human == "gamepad":
         open_gamepad().close()
@@ -306,7 +313,8 @@ def policy(artifact: Path | str | None) -> Iterator[Check]:
             start = time.perf_counter()
             process.predict(frame, np.zeros(2, np.float32))
             times_s.append(time.perf_counter() - start)
-    median_s, fade_s = statistics.median(times_s), float(params()["drive"]["fade_s"])
+    median_s = statistics.median(times_s)
+    fade_s = float(params()["drive"]["fade_s"])
     # just before the next plan is ready, a plan is two inferences old
     finding = f"{1000 * median_s:.0f} ms; the throttle fades from {1000 * fade_s:g} ms of age on"
     remedy = "choose a static artifact or a smaller image, cool the processor, end what else runs"

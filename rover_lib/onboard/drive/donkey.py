@@ -45,7 +45,8 @@ class RoverPilot:
         self, artifact: Path | str, *, throttle_limit: float | None = None, clock: Callable[[], float] = time.monotonic
     ):
         self._settings = Settings.of(params()["drive"], throttle_limit=throttle_limit)
-        self._clock, self._policy = clock, PolicyProcess(Path(artifact).resolve())
+        self._clock = clock
+        self._policy = PolicyProcess(Path(artifact).resolve())
         self._policy.__enter__()
         self._car = car_of(self._policy.manifest)  # which side is positive, and whether it reverses
         self._side = -self._car.left  # donkeycar's angle is positive to the right
@@ -124,7 +125,8 @@ class RoverPilot:
         elif self._picture is None:
             check_shape(self._camera.source, image, seen_size(self._policy.manifest))
         self._camera.add(image, now_s, None)
-        self._picture, self._seen_s = image, now_s
+        self._picture = image
+        self._seen_s = now_s
 
     def _begin(self, now_s: float) -> PolicyPilot:
         try:
@@ -132,7 +134,8 @@ class RoverPilot:
         except RoverError:  # that of a drive before; its thread has ended
             self._planner = self._start_planner()
         self._planning.enter_context(self._planner.without_rest())
-        self._begun_s, self._ready = now_s, False
+        self._begun_s = now_s
+        self._ready = False
         _log.info("the policy drives")
         return PolicyPilot(
             self._camera, self._planner, self._commanded, self._settings, self._policy.rate_hz,
@@ -164,5 +167,6 @@ class RoverPilot:
         """Drive no longer. why: the fault, "" if a human has taken the car; a fault holds until one has."""
         if why and why != self.stopped:
             _log.error("stopped: %s; choose the mode '%s' to begin again", why, USER)
-        self.stopped, self._pilot = why, None
+        self.stopped = why
+        self._pilot = None
         self._planning.close()

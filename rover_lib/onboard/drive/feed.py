@@ -51,7 +51,11 @@ class Feed:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ):
-        self._place, self._log, self._title, self._clock, self._sleep = place, log, title, clock, sleep
+        self._place = place
+        self._log = log
+        self._title = title
+        self._clock = clock
+        self._sleep = sleep
         self._socket: socket.socket | None = None
         self._look_s = self._due_s = 0.0  # earliest times: look for a view, send
 

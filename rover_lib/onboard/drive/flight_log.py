@@ -79,7 +79,8 @@ class Event(NamedTuple):
 def log_limits() -> tuple[int, int]:
     """Return FlightLog's max_bytes and keep from params.yml. Raises ParamsError."""
     section = params()["flight_log"]
-    max_mb, keep = section["max_mb"], section["keep"]
+    max_mb = section["max_mb"]
+    keep = section["keep"]
     if not is_number(max_mb, 0.02, FILE_BYTES / 1e6) or not is_whole(keep, 0):
         problem = f"flight_log: max_mb must be from 0.02 to {FILE_BYTES / 1e6:g}, keep whole and not negative"
         raise ParamsError(problem, found=f"{max_mb!r} and {keep!r}", remedy="see params.yml")
@@ -272,8 +273,11 @@ class Flight:
         jitter: how late commands were. missed: deadlines without a tick. plan_age is over the ticks that had a plan,
         latency over the plans.
         """
-        ticks, period_ms = self.ticks, self.period_ms
-        t_s, late_ms, plans = ticks["t_s"], ticks["late_ms"], ticks["plan"]
+        ticks = self.ticks
+        period_ms = self.period_ms
+        t_s = ticks["t_s"]
+        late_ms = ticks["late_ms"]
+        plans = ticks["plan"]
         _, first = np.unique(plans, return_index=True)  # the first tick of each plan
         latency_ms = ticks["latency_ms"][first][plans[first] > 0] if len(plans) else plans
         throttled = next((bits for *_, bits in reversed(self.machine) if bits is not None), None)

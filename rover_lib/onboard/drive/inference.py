@@ -57,8 +57,13 @@ class Planner:
         limits: np.ndarray = LIMITS,
         clock: Callable[[], float] = time.monotonic,
     ):
-        self._camera, self._policy, self._commanded = camera, policy, commanded
-        self._rest_s, self._latency_s, self._limits, self._clock = rest_s, latency_s, limits, clock
+        self._camera = camera
+        self._policy = policy
+        self._commanded = commanded
+        self._rest_s = rest_s
+        self._latency_s = latency_s
+        self._limits = limits
+        self._clock = clock
         self._closing = threading.Event()
         self._no_rest = threading.Event()
         self._news = threading.Condition()
@@ -173,7 +178,8 @@ class PolicyProcess:
             self.manifest = source.manifest if isinstance(source, Artifact) else read_manifest(source)
         except ArtifactError as error:
             raise PolicyError(error.what, found=error.found, remedy=error.remedy) from None
-        self.rate_hz, self.chunk = float(self.manifest["rate_hz"]), int(self.manifest["chunk"])
+        self.rate_hz = float(self.manifest["rate_hz"])
+        self.chunk = int(self.manifest["chunk"])
         spawn = multiprocessing.get_context("spawn")
         self._pipe, theirs = spawn.Pipe()
         arguments = theirs, str(self.artifact), self.threads
@@ -212,7 +218,8 @@ class PolicyProcess:
             self._pipe.send_bytes(frame.data.cast("B"))
         except (OSError, ValueError) as error:
             raise self._ended() from error
-        answer, tells = np.frombuffer(self._answer(None), np.uint8), "familiar" in self.manifest
+        answer = np.frombuffer(self._answer(None), np.uint8)
+        tells = "familiar" in self.manifest
         if answer.size != 4 * (2 * self.chunk + tells):
             raise PolicyError(f"{self.artifact}: unexpected size of a plan", found=f"{answer.size} bytes")
         values = answer.view(np.float32)

@@ -197,7 +197,8 @@ class _Loop:
             return f"neutral was not answered, the Arduino stops by itself: {sentence_of(error)}"
 
     def run(self) -> str:
-        report, until = self.report, self.until
+        report = self.report
+        until = self.until
         self.start_s = start = self.clock()
         n = seconds = 0
         while True:
@@ -244,7 +245,8 @@ class _Loop:
 
     def _wait(self, deadline: float) -> None:
         """Wait for the deadline; meanwhile send the last command again if it is not acknowledged or is KEEP_S old."""
-        link, last = self.link, self.last
+        link = self.link
+        last = self.last
         while link and last and (again := max(self.sent_s + RESEND_S, self.clock())) < deadline - SPARE_S:
             self.sleep(max(0.0, again - self.clock()))
             try:

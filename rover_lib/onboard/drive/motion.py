@@ -39,7 +39,8 @@ class Motion:
             return
         cells = cells_of(frame.image)
         if self._before is None or difference(cells, self._before) > MOVED:
-            self._before, self.still_s = cells, 0.0
+            self._before = cells
+            self.still_s = 0.0
         elif not self._off_s:
             self.still_s += passed_s
         if self.still_s >= self.stuck_s:
@@ -54,7 +55,8 @@ def cells_of(image: np.ndarray) -> np.ndarray:
     """
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
     blocks = cv2.resize(grey, BLOCKS, interpolation=cv2.INTER_AREA)
-    rows, columns = BLOCKS[1] // DOWN, BLOCKS[0] // (2 * ACROSS)
+    rows = BLOCKS[1] // DOWN
+    columns = BLOCKS[0] // (2 * ACROSS)
     cells = blocks.reshape(rows, DOWN, columns, ACROSS, 2).mean((1, 3)).transpose(2, 0, 1)
     return cells * (100 / max(float(cells.mean()), 1.0))
 

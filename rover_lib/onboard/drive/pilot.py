@@ -66,11 +66,13 @@ class Sight:
     """Judges whether the car may drive by what the camera shows."""
 
     def __init__(self, camera: Camera, settings: Settings):
-        self._camera, self._settings = camera, settings
+        self._camera = camera
+        self._settings = settings
         self._moving_s: float | None = None  # since when the car has been moving
         self._throttle_s = 0.0  # when it was last told to move
         self._blank_s: float | None = None  # since when the picture has been blank
-        self._motion, self._throttle = Motion(settings.stuck_s), 0.0
+        self._motion = Motion(settings.stuck_s)
+        self._throttle = 0.0
 
     def check(self) -> None:
         """Raise CameraError if nobody may drive by the newest frame: it is frozen, black, without contrast or none."""
@@ -126,7 +128,10 @@ class PolicyPilot:
         *,
         calibration: PwmCalibration | None = None,
     ):
-        self._camera, self._planner, self._commanded, self._settings = camera, planner, commanded, settings
+        self._camera = camera
+        self._planner = planner
+        self._commanded = commanded
+        self._settings = settings
         self._calibration = calibration or PwmCalibration()
         self._follower = Follower(settings, rate_hz)
         self.sight = Sight(camera, settings)
@@ -194,7 +199,8 @@ class PolicyPilot:
         plan = self._follower.plan
         self._frame_age_s = self._asking_s = 0.0
         if self._cut > CUT and not self._said_cut:
-            self._said_cut, limit = True, self._settings.throttle_limit
+            self._said_cut = True
+            limit = self._settings.throttle_limit
             yield f"the policy asks for throttle {limit + self._cut:.2f}, cut at throttle_limit {limit:g} (params.yml)"
         if self._follower.strange_s is not None and self._settings.unfamiliar == WARN and not self._said_strange:
             self._said_strange = True

@@ -186,7 +186,8 @@ class Follower:
             return
         if before and self.settings.blend_ticks:
             old = self._wanted(before, now_s) * [1.0, self._fade(now_s - before.captured_s)]
-            self._offset, self._blended = old - self._meant(plan, now_s), 0
+            self._offset = old - self._meant(plan, now_s)
+            self._blended = 0
         self.plan = plan
         if plan.strange is not None:
             self.strange = self._smoother.add(plan.strange)

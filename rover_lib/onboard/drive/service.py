@@ -90,7 +90,11 @@ class Service:
         model: str = "",
         clock: Callable[[], float] = boottime,
     ):
-        self._report, self._stop, self._notify, self._model, self._clock = report, stop, notify, model, clock
+        self._report = report
+        self._stop = stop
+        self._notify = notify
+        self._model = model
+        self._clock = clock
         # Non-blocking: systemd may be busy, and the loop must not wait for it.
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         self._systemd = WatchDog(sock=self._socket)
@@ -194,7 +198,8 @@ class Service:
 
     def over(self) -> str | None:
         """Return why the operator's limits end this drive; None if they do not."""
-        request, now = self._request or Request(), self._clock()
+        request = self._request or Request()
+        now = self._clock()
         if request.max_seconds is not None and now - self._armed_s >= request.max_seconds:
             return f"{request.max_seconds:g} s, as requested"
         if request.heartbeat_s is not None and now - self._heard_s > request.heartbeat_s:
@@ -234,7 +239,8 @@ class Service:
             self._request = request
             self._asked = True
             self._answer = None
-            self._asked_s, self._hung_up = asked_s, hung_up
+            self._asked_s = asked_s
+            self._hung_up = hung_up
             self._turn.notify_all()
         return ""
 

@@ -92,7 +92,8 @@ class Session:
 
         Raises as loop.drive() does, but for a service no DriveFault.
         """
-        options, pilot = self.options, self.make_pilot()
+        options = self.options
+        pilot = self.make_pilot()
         health = HealthWatch(self.report, self.link, self.log, self.settings.undervoltage_s, self.clock)
         with Arming(self, pilot) as arming:
             self.report.clear()
@@ -209,7 +210,8 @@ class Arming(AbstractContextManager["Arming"]):
             if session.link:
                 limit = session.settings.throttle_limit
                 self._armed = arm_capped(session.link, limit, session.log.event, session.check_wanted)
-            self._driving, self._opened = driving, opened.pop_all()
+            self._driving = driving
+            self._opened = opened.pop_all()
         return self._armed
 
     def record(self, *row: Any, **columns: Any) -> None:
@@ -222,7 +224,8 @@ class Arming(AbstractContextManager["Arming"]):
         if not (self._recorder and session.link and self._armed):
             return
         self._driving.close()  # the host no longer drives: ordinary priority, and one plan per second
-        recorder, log = self._recorder.recorder, session.log
+        recorder = self._recorder.recorder
+        log = session.log
         log.event(TAKEN_OVER)
         try:
             rate_hz = session.options.hz

@@ -52,7 +52,8 @@ class TakeoverRecorder:
     """Hands controls to a recorder, and says of each who drove. For the loop's thread. mode: of the artifact."""
 
     def __init__(self, recorder: Recorder, mode: str):
-        self.recorder, self._mode = recorder, mode
+        self.recorder = recorder
+        self._mode = mode
         self._waiting: tuple[tuple, dict[str, Any]] | None = None  # the newest command, perhaps not taken
         self._last_s = float("-inf")  # time of the newest control that was handed over
 
@@ -65,7 +66,8 @@ class TakeoverRecorder:
         """Record the newest command, because the Arduino took it."""
         if self._waiting:
             row, columns = self._waiting
-            self._waiting, self._last_s = None, row[0]
+            self._waiting = None
+            self._last_s = row[0]
             self.recorder.control(*row, mode=self._mode, driver=POLICY, **columns)
 
     def human(
@@ -121,7 +123,8 @@ class TakeoverRecorder:
                     rest_s = None
                 elif rest_s is None:
                     rest_s = telemetry.host_s
-            now_s, first = clock(), None
+            now_s = clock()
+            first = None
             reasons = {
                 "nothing more can be recorded": self.recorder.failure is not None,
                 "told to stop": stop.is_set(),

@@ -43,7 +43,8 @@ def real_time(priority: int) -> Iterator[bool]:
     """
     gc.collect()
     gc.freeze()  # so that garbage collection skips all objects that exist now
-    before, granted = sys.getswitchinterval(), True
+    before = sys.getswitchinterval()
+    granted = True
     sys.setswitchinterval(SWITCH_S)
     try:
         _schedule(os.SCHED_RR | os.SCHED_RESET_ON_FORK, priority)
@@ -95,7 +96,8 @@ def exit_if_hung(report: Report, log: FlightLog) -> Iterator[None]:
     """
 
     def watch() -> None:
-        ticks, turns = 0, 0
+        ticks = 0
+        turns = 0
         while not done.wait(HUNG_S / 6):
             turns = turns + 1 if ticks == report.ticks and not report.ended else 0
             ticks = report.ticks

@@ -69,7 +69,8 @@ def main(module: str, name: str, arguments: str) -> None:
     """Run as the program that run_confined() starts: print the function's result, or its error, as JSON."""
     answers = os.dup(1)
     os.dup2(2, 1)  # whatever else is printed is no answer
-    result, refusal = None, None
+    result = None
+    refusal = None
     try:
         result = getattr(importlib.import_module(module), name)(**json.loads(arguments))
     except RoverError as error:

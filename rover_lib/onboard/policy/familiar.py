@@ -24,7 +24,10 @@ class Familiar:
     """
 
     def __init__(self, mean: np.ndarray, directions: np.ndarray, spread: np.ndarray, limits: np.ndarray):
-        self.mean, self.directions, self.spread, self.limits = mean, directions, spread, limits
+        self.mean = mean
+        self.directions = directions
+        self.spread = spread
+        self.limits = limits
 
     @classmethod
     def of(cls, vectors: Mapping[str, np.ndarray]) -> "Familiar | None":

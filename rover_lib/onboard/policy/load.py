@@ -58,7 +58,8 @@ class Policy:
         self.cameras: tuple[str, ...] = tuple(c["name"] for c in manifest["cameras"])
         self.chunk: int = manifest["chunk"]
         self.rate_hz = float(manifest["rate_hz"])
-        self._engine, self.familiar = engine, familiar
+        self._engine = engine
+        self.familiar = familiar
         self.strange: float | None = None
         self.car = car_of(manifest)
         self._low, self._high = action_limits(self.action_names, self.car)
@@ -119,7 +120,8 @@ class Policy:
 
 def import_engine(artifact: Artifact) -> Any:
     """Import the module of the engine that an artifact needs. Raises ArtifactError if it is not installed."""
-    path, name = artifact.path, artifact.manifest["engine"]
+    path = artifact.path
+    name = artifact.manifest["engine"]
     try:
         return importlib.import_module(MODULES[name])
     except KeyError:
@@ -149,7 +151,8 @@ def load_policy(source: Path | str | Artifact, *, threads: int | None = None) ->
             return load_policy(artifact, threads=threads)
     source.prove()
     engine = import_engine(source).load(source, threads)
-    path, vectors = source.path, source.parity
+    path = source.path
+    vectors = source.parity
     policy = Policy(path, engine, source.manifest, Familiar.of(vectors))
     chunks, strange = _predict(policy, vectors)
     _check(policy, chunks, strange, vectors)
@@ -169,7 +172,8 @@ def give_back_freed() -> None:
 def _predict(policy: Policy, vectors: Mapping[str, np.ndarray]) -> tuple[np.ndarray, list[float | None]]:
     """Return the policy's answers to the parity vectors: (n, chunk, A) float32, and n times Policy.strange."""
     frames = [vectors[f"frame_{c}"] for c in policy.cameras]
-    chunks, strange = [], []
+    chunks = []
+    strange = []
     try:
         for i, state in enumerate(vectors["state"]):
             chunks.append(policy.run(state, [f[i] for f in frames]))

@@ -18,7 +18,8 @@ ERRORS_ONLY = 3  # log level; ONNX Runtime warns of what a machine without a gra
 def session_of(model: bytes, threads: int, path: Path | str = "the model") -> onnxruntime.InferenceSession:
     """Make a session for one of our models, on the processor. path: the model's, for errors. Raises ArtifactError."""
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
     options.log_severity_level = ERRORS_ONLY
     # A thread that waits for work by spinning takes the control loop's turn, and warms the processor for nothing.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
@@ -38,7 +39,8 @@ class OnnxEngine(Engine):
     """The model of an ONNX artifact. Make it with `load`."""
 
     def __init__(self, path: Path, model: bytes, threads: int):
-        self._session, self.threads = session_of(model, threads, path), threads
+        self._session = session_of(model, threads, path)
+        self.threads = threads
         self.names = [i.name for i in self._session.get_inputs()]
 
     def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -51,7 +53,8 @@ class OnnxEngine(Engine):
 
 def load(artifact: Artifact, threads: int | None) -> OnnxEngine:
     """Load an artifact. Raises ArtifactError if ONNX Runtime refuses it, or its inputs are not the manifest's."""
-    path, manifest = artifact.path, artifact.manifest
+    path = artifact.path
+    manifest = artifact.manifest
     engine = OnnxEngine(path, artifact.record(ONNX), threads or usable_cores())
     names = ["state", *(f"frame_{c['name']}" for c in manifest["cameras"])]
     if engine.names != names:

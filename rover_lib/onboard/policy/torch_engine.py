@@ -42,8 +42,10 @@ class TorchEngine:
 
 def load(artifact: Artifact, threads: int | None) -> TorchEngine:
     """Load an artifact. Raises ArtifactError if it was made with another torch, or cannot be loaded."""
-    path, manifest = artifact.path, artifact.manifest
-    made_with, here = str(manifest["versions"].get("torch", "?")), torch.__version__
+    path = artifact.path
+    manifest = artifact.manifest
+    made_with = str(manifest["versions"].get("torch", "?"))
+    here = torch.__version__
     if made_with.split(".")[:2] != here.split(".")[:2]:
         remedy = "make it again where this torch is: rover run CHECKPOINT EPISODES"
         raise ArtifactError(f"{path}: made with torch {made_with}", found=here, remedy=remedy)
@@ -63,9 +65,11 @@ def give_back_packed_weights(module: torch.jit.ScriptModule) -> int:
     module: frozen, and has run once, so that its weights are packed. It cannot be saved afterwards, and the caller must
     check that it still predicts the same.
     """
-    libc, total = ctypes.CDLL(None), 0
+    libc = ctypes.CDLL(None)
+    total = 0
     for weight in _originals(module.graph):
-        start, size = weight.untyped_storage().data_ptr(), weight.untyped_storage().nbytes()
+        start = weight.untyped_storage().data_ptr()
+        size = weight.untyped_storage().nbytes()
         first = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE  # only whole pages, because others may share the rest
         length = (start + size) // mmap.PAGESIZE * mmap.PAGESIZE - first
         if length > 0 and libc.madvise(ctypes.c_void_p(first), ctypes.c_size_t(length), DONT_NEED) == 0:

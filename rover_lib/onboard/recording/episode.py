@@ -93,8 +93,11 @@ class EpisodeWriter:
         jpeg_quality: int = 95,
         flags: bool = False,
     ):
-        self.folder, self.about = Path(folder), about
-        self.resolution, self.jpeg_quality, self.flags = resolution, jpeg_quality, flags
+        self.folder = Path(folder)
+        self.about = about
+        self.resolution = resolution
+        self.jpeg_quality = jpeg_quality
+        self.flags = flags
         car = about.car or Car()
         self.pwm = car.pwm
         self.metadata: dict[str, Any] = {}  # further entries of the episode's metadata
@@ -104,7 +107,8 @@ class EpisodeWriter:
             self.metadata["source"] = about.source
         self.controls = self.frames = self.picture_bytes = 0
         self._extra: dict[str, None] = {}  # names of further columns, in order
-        self._first_s, self._last_s = math.inf, -math.inf
+        self._first_s = math.inf
+        self._last_s = -math.inf
         self._part: Path | None = None  # the hidden folder, while it is open
         self._lock: int | None = None
         self._rows: dict[str, FileIO] = {}
@@ -210,7 +214,8 @@ class EpisodeWriter:
                 picture.unlink()
             raise
         self._append("frame", {"frame_id": number, "timestamp": float(t_s), "image_path": relative}, t_s)
-        self.frames, self.picture_bytes = number, self.picture_bytes + len(jpeg)
+        self.frames = number
+        self.picture_bytes = self.picture_bytes + len(jpeg)
 
     def finish(self) -> Path:
         """Make the folder appear and return it. If that fails, the hidden folder stays, and EpisodeError says why."""
@@ -248,7 +253,8 @@ class EpisodeWriter:
 
     def _take(self, part: Path, lock: int) -> None:
         """Go on with what an ended process has left in a hidden folder."""
-        self._part, self._lock = part, lock
+        self._part = part
+        self._lock = lock
         names = {*CONTROL_FIELDS, *FLAG_FIELDS}
         for kind, time in KINDS.items():
             for row in _rows(part, kind):
@@ -263,7 +269,8 @@ class EpisodeWriter:
                 self.controls += kind == "control"
                 self.frames += kind == "frame"
                 self._extra |= dict.fromkeys(name for name in row if kind == "control" and name not in names)
-                self._first_s, self._last_s = min(self._first_s, row[time]), max(self._last_s, row[time])
+                self._first_s = min(self._first_s, row[time])
+                self._last_s = max(self._last_s, row[time])
                 if kind == "frame" and self.resolution is None:
                     image = cv2.imread(str(part / row["image_path"]))
                     if image is not None:
@@ -283,7 +290,8 @@ class EpisodeWriter:
             if (count := file.write(line)) < len(line):
                 file.truncate(file.tell() - count)  # half a row would spoil the next one
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        self._first_s, self._last_s = min(self._first_s, t_s), max(self._last_s, t_s)
+        self._first_s = min(self._first_s, t_s)
+        self._last_s = max(self._last_s, t_s)
 
     def _keep_synced(self) -> None:
         while self._part and not self._closing.wait(SYNC_S):
@@ -446,7 +454,8 @@ def driver_of(row: Mapping[str, Any]) -> str | None:
 
 def arduino_step_s(before_s: float, after_s: float) -> float:
     """Return the seconds between two readings of the Arduino's clock, which may wrap; NaN if it did not go on."""
-    step_s, wrap_s = after_s - before_s, ARDUINO_WRAP_MS / 1000
+    step_s = after_s - before_s
+    wrap_s = ARDUINO_WRAP_MS / 1000
     if before_s < wrap_s and -wrap_s < step_s < -wrap_s / 2:
         step_s += wrap_s
     return step_s if step_s > 0 else math.nan

@@ -52,7 +52,9 @@ class Recorder(contextlib.AbstractContextManager["Recorder"]):
         most_bytes: int | None = None,
         clock: Callable[[], float] = time.monotonic,
     ):
-        self._camera, self._clock, self._most_bytes = camera, clock, most_bytes
+        self._camera = camera
+        self._clock = clock
+        self._most_bytes = most_bytes
         self.start_s = clock()
         self._to_system_s = time.time() - self.start_s
         self._frame_s = 0.75 / rate_hz  # a frame that comes sooner is left out: the camera is faster
@@ -168,7 +170,8 @@ class Recorder(contextlib.AbstractContextManager["Recorder"]):
                     problem = f"{self._camera.source}: no frame for {SILENT_S:g} s"
                     raise EpisodeError(problem, remedy="is the camera plugged in?")
                 continue
-            number, last_s = frame.number, now
+            number = frame.number
+            last_s = now
             if frame.captured_s - captured_s < self._frame_s:
                 continue
             captured_s = frame.captured_s
@@ -310,7 +313,8 @@ def record_episodes(
     options: of record(). SIGINT ends an episode; a second one, or one in the pause before the next episode, ends the
     recording, as SIGTERM, SIGHUP, SIGQUIT and a fault do. Raises RoverError if recording cannot begin.
     """
-    stop, leave = SignalEvent(), SignalEvent()
+    stop = SignalEvent()
+    leave = SignalEvent()
 
     def on_signal(number: int, _: object) -> None:
         if number != signal.SIGINT or stop.is_set():

@@ -45,7 +45,8 @@ class CarShape:
 
         Raises ParamsError for values that no car can have, CarError as this_car().
         """
-        car, section = car or this_car(), params()["view"]
+        car = car or this_car()
+        section = params()["view"]
         try:
             return cls(**section, wheelbase_m=car.wheelbase_m, focal=car.focal_px / WIDTH_PX, left=car.left)
         except TypeError as error:  # a name too many or too few

@@ -99,7 +99,10 @@ class View:
         ask: Callable[[str], object] | None = None,
         script: bytes = b"",
     ):
-        self._address, self._token, self._place, self._ask = address, token, place, ask
+        self._address = address
+        self._token = token
+        self._place = place
+        self._ask = ask
         self._users = {0, os.geteuid()}
         if drive_user:
             try:
@@ -183,7 +186,8 @@ class View:
             "stopped": pins is not None and abs(pins[1] - self._pwm.throttle.neutral_us) <= ARDUINO_STEP_US,
             "throttled": ", ".join(means) if means else "",
         }
-        self._head, self._picture = head, picture
+        self._head = head
+        self._picture = picture
         self._news.set()
         self._news = asyncio.Event()
 
@@ -215,7 +219,8 @@ class View:
         return wire
 
     async def _accept(self, wire: socket.socket) -> None:
-        loop, tasks = asyncio.get_running_loop(), set()
+        loop = asyncio.get_running_loop()
+        tasks = set()
         while True:
             try:
                 drive, _ = await loop.sock_accept(wire)
@@ -253,7 +258,8 @@ class View:
     def _meet(self, runner: web.AppRunner) -> asyncio.Protocol:
         """Return a new connection's handler; without a token it has to leave soon, or as soon as many others come."""
         assert runner.server, "it was set up"
-        loop, stranger = asyncio.get_running_loop(), runner.server()
+        loop = asyncio.get_running_loop()
+        stranger = runner.server()
         self._strangers[stranger] = None
         loop.call_later(STRANGER_S, self._part, stranger)
         if len(self._strangers) > MOST_STRANGERS:
@@ -310,7 +316,8 @@ class View:
             while True:
                 while page.sent == self._number:
                     await self._news.wait()
-                page.sent, page.captured_s = self._number, self._head.get("captured_s")
+                page.sent = self._number
+                page.captured_s = self._head.get("captured_s")
                 page.showing.clear()
                 head = json.dumps(self._head | {"n": page.sent, "delay_ms": page.delay_ms})
                 await wire.send_bytes(head.encode() + b"\n" + self._picture)

@@ -129,7 +129,8 @@ class Checkpoint:
         """Return the policy with the order of numbers, and LeRobot's with the cameras and the rate of the dataset."""
         c = self.config
         notes = list[str]()
-        states, actions = layout.state_order, layout.action_order
+        states = layout.state_order
+        actions = layout.action_order
         if "actions" not in guessed:
             if set(c.action_names) != set(layout.action_names):
                 return self

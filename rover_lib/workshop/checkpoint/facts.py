@@ -114,7 +114,8 @@ class Facts:
 
     def _read_key(self, key: "_Key") -> bool:
         """Read a key whose name and value plainly say a fact; False for others."""
-        name, value = key.name, key.value
+        name = key.name
+        value = key.value
         named = value
         if isinstance(value, str) and key.has("order"):
             named = [word for word in re.findall("[a-z]+", value.lower()) if word in CHANNELS]

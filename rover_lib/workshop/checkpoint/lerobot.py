@@ -155,7 +155,8 @@ def _without_constants(
 
 def _compare_statistics(config: ActConfig, inner: "Normaliser", outer: "Normaliser", facts: Facts) -> None:
     """Note a state of two numbers whose statistics are not those of the actions: a car's state is its last action."""
-    state, action = inner.statistics("observation.state"), outer.statistics("action")
+    state = inner.statistics("observation.state")
+    action = outer.statistics("action")
     if config.action_names != ACTION_NAMES or not (len(state) == len(action) == 2):
         return
     for name, (mean, std), (own_mean, own_std) in zip(config.state_names, state, action, strict=True):
@@ -399,7 +400,8 @@ def write_lerobot(folder: Path, config: ActConfig, weights: dict[str, Tensor], o
     from lerobot.policies.act.processor_act import make_act_pre_post_processors
 
     policy = lerobot_act(config, weights)
-    raw, normed = NormalizationMode.IDENTITY, NormalizationMode.MEAN_STD
+    raw = NormalizationMode.IDENTITY
+    normed = NormalizationMode.MEAN_STD
     modes = {"STATE": normed if config.state_norm else raw, "ACTION": normed if config.action_unnorm else raw}
     policy.config.normalization_mapping = {"VISUAL": normed, **modes}
     pictures = zip(config.cameras, config.image_norm, strict=True)
@@ -420,5 +422,6 @@ def write_lerobot(folder: Path, config: ActConfig, weights: dict[str, Tensor], o
 
 def _statistics(norm: Affine, shape: tuple[int, ...]) -> dict[str, Tensor]:
     """Mean and standard deviation whose normalisation, LeRobot's eps included, is x * scale + shift."""
-    scale, shift = torch.tensor(norm.scale, dtype=torch.float64), torch.tensor(norm.shift, dtype=torch.float64)
+    scale = torch.tensor(norm.scale, dtype=torch.float64)
+    shift = torch.tensor(norm.shift, dtype=torch.float64)
     return {"mean": (-shift / scale).float().reshape(shape), "std": (1 / scale - EPS).float().reshape(shape)}

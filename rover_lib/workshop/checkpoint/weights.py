@@ -80,7 +80,8 @@ def check_weights_are_whole(facts: Facts, weights: Mapping[str, Any]) -> Weights
         raise facts.refusal(first, value, meaning, ",".join(sorted({*outside.values()})))
     weights = {name: weights[name] for name in weights if re.fullmatch(r"model\..*", name)}
     weights = {name: weight for name, weight in weights.items() if not re.fullmatch(COUNTS, name)}
-    odd, torn = [], []
+    odd = []
+    torn = []
     for name, weight in weights.items():
         dense = isinstance(weight, Tensor) and weight.layout == torch.strided and weight.device.type == "cpu"
         if not dense or not weight.is_floating_point():  # as a quantized tensor is not

@@ -105,7 +105,8 @@ class RangeObserver(UniformQuantizationObserverBase):
     def _least_squares(self, low: float, high: float) -> tuple[float, float]:
         """The range whose rounding plus clipping has the least squared error over the histogram."""
         shrink = torch.linspace(1.0, 0.1, 31)
-        lows, highs = low * shrink, high * shrink
+        lows = low * shrink
+        highs = high * shrink
         used = self.histogram > 0
         weight = self.histogram[used] / self.histogram.sum()
         x = self._centres()[used]

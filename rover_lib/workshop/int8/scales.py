@@ -66,7 +66,8 @@ def _scale_memory(model: ACT, maxima: Maxima, smooth: float) -> None:
 
 
 def _scale_attention(name: str, part: Any, memory: Any, maxima: Maxima, smooth: float) -> None:
-    out, even = {}, {}
+    out = {}
+    even = {}
     for p in "kvo" if part.constant_q is not None else "qkvo":
         out[p] = _output_scale(maxima[f"{name}.{p}"]["out_max"])
         even[p] = _matrix(getattr(part, p)) / out[p][:, None]
@@ -75,7 +76,8 @@ def _scale_attention(name: str, part: Any, memory: Any, maxima: Maxima, smooth: 
         return _input_scale(maxima[f"{name}.{p}"]["in_max"], list(matrices), smooth)
 
     if part.cross:
-        k_in, v_in = memory.k_in, memory.v_in
+        k_in = memory.k_in
+        v_in = memory.v_in
     else:  # self-attention: one input for Q and K
         k_in, v_in = part.k_in, part.v_in = input_scale("k", even["q"], even["k"]), input_scale("v", even["v"])
     o_in = input_scale("o", even["o"])

@@ -106,7 +106,8 @@ def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]
             "worlds_decide": any(r["gate"].endswith(WORLDS_LOST) and r["passed"] is not None for r in gate_rows),
             "missed_gates": [r | {"words": gate_in_words(r["gate"])} for r in missed],
         }
-    static, mixed = rows.get("static"), rows.get("mixed")
+    static = rows.get("static")
+    mixed = rows.get("mixed")
     if static and mixed and static["time_ms"] and mixed["time_ms"] and mixed["time_ms"] < static["time_ms"]:
         # It does the same work and some of it in float: its shorter time is chance.
         mixed |= {key: static[key] for key in ("time_ms", "times_faster")}
@@ -143,7 +144,8 @@ def time_key(benchmark: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
 
 def _busy(benchmark: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
     """Say what shows that the machine did other things while it took the times; empty if nothing does."""
-    cores, own_pct = benchmark.get("cpu_per_core_pct"), benchmark.get("cpu_pct")
+    cores = benchmark.get("cpu_per_core_pct")
+    own_pct = benchmark.get("cpu_pct")
     if cores and own_pct is not None and len(cores) == benchmark.get("cores"):
         others_pct = sum(cores) / len(cores) - own_pct
         if others_pct > limits["busy_pct"]:

@@ -185,7 +185,8 @@ def _note_repeated(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> 
     rest = [drive for drive in drives if not drive.frozen]
     often = [drive for drive in rest if drive.compared >= LEAST_COMPARED and not drive.shows_nothing]
     alone = [drive for drive in often if drive.equal >= OF_ONE * drive.compared]
-    compared, equal = sum(drive.compared for drive in rest), sum(drive.equal for drive in rest)
+    compared = sum(drive.compared for drive in rest)
+    equal = sum(drive.equal for drive in rest)
     all_of_them = compared >= LEAST_COMPARED and equal >= REPEATED * compared
     for repeated in [rest] if all_of_them else [[drive] for drive in alone]:
         share = sum(drive.equal for drive in repeated) / sum(drive.compared for drive in repeated)

@@ -157,7 +157,8 @@ def measure_turning(drive: Sequence[Episode]) -> Turning:
 
 def _shifts(samples: Sequence[Sample]) -> tuple[np.ndarray, np.ndarray]:
     """Return when two pictures were compared, in seconds, and how fast the background moved right, in pixels/s."""
-    times_s, shifts = [], []
+    times_s = []
+    shifts = []
     grey = lru_cache(1)(_grey)  # the second picture of a pair is the first one of the next
     for first, second in pairwise(samples[::STEP]):
         if second.row - first.row == STEP and (shift := _shift(grey(first), grey(second))) is not None:
@@ -190,7 +191,8 @@ def _smooth(values: np.ndarray) -> np.ndarray:
 
 def _correlation(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
     """Return the correlation of two series, and how many standard errors it is from 0; None if one does not vary."""
-    x, y = x - x.mean(), y - y.mean()
+    x = x - x.mean()
+    y = y - y.mean()
     n = len(x)
     norm = math.sqrt((x @ x) * (y @ y))
     if norm < 1e-9:

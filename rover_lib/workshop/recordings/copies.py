@@ -96,7 +96,8 @@ def _is_same(a: np.ndarray, b: np.ndarray) -> bool:
     contrast = np.abs(a - a.mean()).mean()
     if np.abs(a - b).mean() < min(ALIKE, OF_CONTRAST * contrast):
         return True
-    a, b = a - a.mean(), b - b.mean()
+    a = a - a.mean()
+    b = b - b.mean()
     return float((a * b).sum()) > CORRELATED * float(np.linalg.norm(a) * np.linalg.norm(b))
 
 

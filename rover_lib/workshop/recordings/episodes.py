@@ -227,7 +227,8 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
         if not isinstance(row, dict):
             faults.add(path, "wrong_type", f"frame {i} is a {type(row).__name__}, not an object")
             continue
-        number, time_s = number_of(row.get("frame_id")), number_of(row.get("timestamp"))
+        number = number_of(row.get("frame_id"))
+        time_s = number_of(row.get("timestamp"))
         name = row.get("image_path")
         nan = math.isnan(number or 0) or math.isnan(time_s or 0)
         if nan or number is None or time_s is None or not isinstance(name, str) or not name:

@@ -134,7 +134,8 @@ def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, s
     if hashes != (static["content_hash"], stage["inputs"]["calibration.pt"]):
         problem = f"{run_dir}: policy_static.pt and calibration.pt are not those of quantize.json"
         raise ArtifactError(problem, remedy="quantize again")
-    calibration, drives = Calibration.load(calibrated), Drives.of(parts)
+    calibration = Calibration.load(calibrated)
+    drives = Drives.of(parts)
     policies: dict[str, ACT | QuantizedPolicy] = {
         "fp32": ACT(checkpoint.config, checkpoint.weights),
         "static": quantize(checkpoint, Scheme.of(static["scheme"]), calibration),

@@ -41,7 +41,8 @@ def in_todays_units(policy: Checkpoint, recordings: Recordings, samples: Sequenc
     for formulas in tried:
         converted = _in_units_of(policy, car, formulas)
         if (error := planned_error(converted, samples_tried, 1)) <= best_error:
-            best, best_error = converted, error
+            best = converted
+            best_error = error
     return best
 
 
@@ -54,8 +55,10 @@ def _in_units_of(policy: Checkpoint, car: Car, formulas: Mapping[str, Channel]) 
     gains = np.array([c.span_pct for c in channels]) / span
     offsets = (np.array([c.neutral_pct for c in channels]) - neutral) / span
     same = Affine((1.0, 1.0), (0.0, 0.0))
-    state, action = policy.config.state_norm or same, policy.config.action_unnorm or same
-    scale, shift = np.array(action.scale), np.array(action.shift)
+    state = policy.config.state_norm or same
+    action = policy.config.action_unnorm or same
+    scale = np.array(action.scale)
+    shift = np.array(action.shift)
     config = replace(
         policy.config,
         state_norm=_affine(np.array(state.scale) * gains, np.array(state.scale) * offsets + np.array(state.shift)),
