@@ -22,7 +22,7 @@ from rover_lib.workshop.run.run import NAMES, NOTEBOOKS
 
 RESULTS_OF = {"05_benchmark": "benchmark-*", "08_distill": "students"}  # the others' stages are their names
 # Where make leaves them.
-OF_LABORATORY = ("faults*.json", "random.json", "mutants.json", "strange.json", "judging.json", "drives.json")
+OF_LABORATORY = ("faults*.json", "random.json", "mutants.json", "strange.json", "judging.json", "drives*.json")
 PICTURES = {"sensitivity": ("03_sensitivity", "quantize"), "worst_frames": ("04_worst_frames", "compare")}  # of figures
 LIMIT = 1_000_000  # bytes, of a committed notebook or JSON
 DIGITS = 6  # of each number: pages, notebooks and tests read four
