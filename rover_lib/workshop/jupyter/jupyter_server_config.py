@@ -5,6 +5,7 @@ into its metadata. So a stored one would count as changed, in git and for the ne
 """
 
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -26,5 +27,7 @@ def keep_metadata(model: dict[str, Any], path: str, contents_manager: Any, **_: 
         metadata.pop("widgets", None)
 
 
+# traitlets sets it twice, from the same file.
+warnings.filterwarnings("ignore", "Overriding existing pre_save_hook")
 c = get_config()  # type: ignore[name-defined]  # noqa: F821, traitlets puts it there
 c.ContentsManager.pre_save_hook = keep_metadata
