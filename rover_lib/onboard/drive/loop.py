@@ -117,7 +117,7 @@ def drive(
         hooks: what else is called at each tick.
         report: filled during the drive.
         clock: in seconds.
-        sleep: for so many seconds.
+        sleep: waits for that many seconds.
 
     Returns:
         The report.

@@ -342,7 +342,7 @@ def test_an_artifact_says_what_it_is(tiny, calibration, tmp_path):
 
 
 def test_a_tolerance_by_hand(tiny):
-    """FP32's grows with an action beyond 1; INT8's is so many times its largest error, and never less than FP32's."""
+    """FP32's grows with an action beyond 1; INT8's is a multiple of its largest error, and never less than FP32's."""
     exporter = Exporter(tiny, memory_samples(2))
     exporter.parity = {"vectors": 2, "fp32": 0.001, "int8_errors": 3}
     exporter.float_actions = torch.tensor([[[0.5, 40.0]], [[-0.5, 20.0]]])
