@@ -33,13 +33,21 @@ def explain_state(states: np.ndarray, actions: np.ndarray, names: Sequence[str])
         actions = actions.astype(float)
         for i, name in enumerate(names):
             words = _explain(states[:, i], actions[:, i])
-            for j, other in enumerate(names if words == FOLLOWS_NONE else ()):
-                follows = _explain(states[:, i], actions[:, j])
-                if follows != FOLLOWS_NONE:
-                    words = f"{follows or _called(1)}, of {other}"
+            if words == FOLLOWS_NONE:
+                words = _explain_by_any(states[:, i], actions, names)
             if words:
                 names_by_words.setdefault(words, []).append(name)
     return ", ".join(f"{' and '.join(names_alike)}: {words}" for words, names_alike in names_by_words.items())
+
+
+def _explain_by_any(state: np.ndarray, actions: np.ndarray, names: Sequence[str]) -> str:
+    """Say which of the actions, (n, A) of these names, a state follows, as when columns are swapped."""
+    words = FOLLOWS_NONE
+    for name, action in zip(names, actions.T, strict=True):
+        follows = _explain(state, action)
+        if follows != FOLLOWS_NONE:
+            words = f"{follows or _called(1)}, of {name}"
+    return words
 
 
 def _explain(state: np.ndarray, action: np.ndarray) -> str:

@@ -50,9 +50,13 @@ class Familiar:
         distances = np.sqrt(((along / self.spread) ** 2).mean(1))
         return np.stack([distances, np.linalg.norm(centred - along @ self.directions, axis=1)], 1)
 
+    def shares(self, embeddings: np.ndarray) -> np.ndarray:
+        """Return the scores of each embedding, (n, D) float32 -> (n, 2), as shares of the limits."""
+        return self.scores(embeddings) / self.limits
+
     def check_limits(self, embeddings: np.ndarray, where: object) -> None:
         """Raise ArtifactError if recorded embeddings, (n, D), come nowhere near a limit: it would stop nothing."""
-        share = float((self.scores(embeddings) / self.limits).max(0).min())
+        share = float(self.shares(embeddings).max(0).min())
         if not share >= LEAST_SHARE:
             problem = f"{where}: its limits of the unfamiliar are so wide that they would stop nothing"
             remedy = "leave out a recording that is unlike all others, and quantize again"
@@ -60,4 +64,4 @@ class Familiar:
 
     def strange(self, embeddings: np.ndarray) -> np.ndarray:
         """Return how unfamiliar each embedding is, (n, D) float32 -> (n,), as a share of the threshold."""
-        return (self.scores(embeddings) / self.limits).max(1)
+        return self.shares(embeddings).max(1)

@@ -215,7 +215,7 @@ class EpisodeWriter:
             raise
         self._append("frame", {"frame_id": number, "timestamp": float(t_s), "image_path": relative}, t_s)
         self.frames = number
-        self.picture_bytes = self.picture_bytes + len(jpeg)
+        self.picture_bytes += len(jpeg)
 
     def finish(self) -> Path:
         """Make the folder appear and return it. If that fails, the hidden folder stays, and EpisodeError says why."""

@@ -278,17 +278,15 @@ class Normaliser:
     def __init__(self, folder: Path, file: str, normalises: str, said: SimpleNamespace, inside: dict[str, Tensor]):
         """Raises CheckpointError for a step that is unknown."""
         self.where = folder / file
-        content = dict[str, Any]()
-        steps = list[dict[str, Any]]()
+        own = {"features": said.input_features | said.output_features, "norm_map": said.normalization_mapping}
+        content: dict[str, Any] = {"steps": [{"registry_name": normalises, "config": own}]}
         tensors = inside
+        if self.where.exists():
+            content = _read_json(self.where)
+            tensors = {}
+        steps = list[dict[str, Any]]()
         with files.as_checkpoint_error(self.where):
-            if self.where.exists():
-                content = _read_json(self.where)
-                tensors = {}
-            else:
-                features = said.input_features | said.output_features
-                steps.append({"features": features, "norm_map": said.normalization_mapping})
-            for step in content["steps"] if content else ():
+            for step in content["steps"]:
                 name = step.get("registry_name") or step["class"]
                 config = step.get("config") or {}
                 if config.get("enabled") is False:

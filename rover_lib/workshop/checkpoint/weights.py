@@ -71,15 +71,14 @@ def check_weights_are_whole(facts: Facts, weights: Mapping[str, Any]) -> Weights
     outside = dict[str, str]()  # and what stands before their names, by which they can be ignored
     for name in weights:
         begins = name.split("." if "." in name else "_")[0]
-        if not re.fullmatch(rf"model\..*|{COUNTS}", name) and begins not in facts.ignored:
+        if not (name.startswith("model.") or re.fullmatch(COUNTS, name) or begins in facts.ignored):
             outside[name] = begins
     if outside:
         first = next(filter(meaning_of, outside), next(iter(outside)))
         meaning = meaning_of(first) or "and nobody here knows what that does"
         value = f"one of {len(outside)} that LeRobot's ACT does not have"
         raise facts.refusal(first, value, meaning, ",".join(sorted({*outside.values()})))
-    weights = {name: weights[name] for name in weights if re.fullmatch(r"model\..*", name)}
-    weights = {name: weight for name, weight in weights.items() if not re.fullmatch(COUNTS, name)}
+    weights = {name: weights[name] for name in weights if name.startswith("model.") and not re.fullmatch(COUNTS, name)}
     odd = []
     torn = []
     for name, weight in weights.items():

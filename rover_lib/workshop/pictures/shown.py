@@ -184,15 +184,16 @@ def _note_repeated(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> 
     """Add a fault if all drives together, or one that was looked at often, have each picture several times."""
     rest = [drive for drive in drives if not drive.frozen]
     often = [drive for drive in rest if drive.compared >= LEAST_COMPARED and not drive.shows_nothing]
-    alone = [drive for drive in often if drive.equal >= OF_ONE * drive.compared]
+    groups = [[drive] for drive in often if drive.equal >= OF_ONE * drive.compared]
     compared = sum(drive.compared for drive in rest)
     equal = sum(drive.equal for drive in rest)
-    all_of_them = compared >= LEAST_COMPARED and equal >= REPEATED * compared
-    for repeated in [rest] if all_of_them else [[drive] for drive in alone]:
+    if compared >= LEAST_COMPARED and equal >= REPEATED * compared:
+        groups = [rest]
+    for repeated in groups:
         share = sum(drive.equal for drive in repeated) / sum(drive.compared for drive in repeated)
         note = f"{share:.0%} of the pictures{of_camera} equal the next one, though the car moves"
         files = round(share * sum(drive.episode.frames for drive in repeated))
-        place = faults.root if all_of_them else repeated[0].episode.place
+        place = faults.root if repeated is rest else repeated[0].episode.place
         faults.add(place, "repeated_pictures", f"{note}: is the camera slower, or does it stop now and then?", files)
 
 
@@ -210,11 +211,15 @@ def _note_others(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> No
         return
     covered = np.array([min(piece.covered for piece in pieces) for pieces in long])
     covered *= (covered < DARK_PLACE).mean() >= 0.5  # else the place is dark
+    uncovered = []
     for pieces, share in zip(long, covered.tolist(), strict=True):
-        for drive in pieces if share > COVERED else ():
-            note = f"{share:.0%} of each picture{of_camera} is black, and not of the other drives': leave it out"
+        if share <= COVERED:
+            uncovered.append(pieces)
+            continue
+        note = f"{share:.0%} of each picture{of_camera} is black, and not of the other drives': leave it out"
+        for drive in pieces:
             faults.add(drive.episode.place, "covered_lens", f"{note}, and look at the lens", drive.episode.frames)
-    long = [pieces for pieces, share in zip(long, covered, strict=True) if share <= COVERED]
+    long = uncovered
     if len(long) < LEAST_DRIVES:
         return
     pictures = [np.concatenate([piece.pictures for piece in pieces]) for pieces in long]

@@ -9,29 +9,30 @@ from rover_lib.workshop.recordings import copies
 from rover_lib.workshop.recordings.faults import Faults
 from rover_lib.workshop.recordings.samples import Episode
 
+MIRRORED, BACKWARDS = ", mirrored", ", backwards"  # ways in which a drive is another's twin
+
 
 def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episode, ...]:
     """Return the episodes without copies of others, of which the longest is kept, nor mirrored or backward ones.
 
     Held out, such a drive is judged by a policy that was calibrated, or trained, on its twin.
     """
-    turned = {_mirror(episode): (episode, ", mirrored") for episode in episodes}
-    turned |= {replace(episode, samples=episode.samples[::-1]): (episode, ", backwards") for episode in episodes}
+    turned = {_mirror(episode): (episode, MIRRORED) for episode in episodes}
+    turned |= {replace(episode, samples=episode.samples[::-1]): (episode, BACKWARDS) for episode in episodes}
     left_out = set[Episode]()
     pairs = copies.find_copies((*episodes, *turned))
     for pair in sorted(pairs, key=lambda pair: (not turned.keys().isdisjoint(pair), pair[0].place.as_posix())):
-        pieces = [turned.get(episode, (episode, "")) for episode in pair]
-        (one, how), (other, how_other) = pieces
+        (one, one_way), (other, other_way) = (turned.get(episode, (episode, "")) for episode in pair)
         first, second = sorted((one, other), key=lambda e: (-len(e.samples), episodes.index(e)))
-        as_it_is = how == how_other == ""
-        if first is second or left_out & {first, second} or (how and how_other):
+        if first is second or left_out & {first, second} or (one_way and other_way):
             continue
-        if "backwards" in how + how_other and not copies.pictures_change(first):
+        way = one_way or other_way
+        if way == MIRRORED and _is_symmetric(first):
+            continue
+        if way == BACKWARDS and not copies.pictures_change(first):
             continue  # of a picture that stands still nothing says which way it goes
-        if as_it_is or "mirrored" not in how + how_other or not _is_symmetric(first):
-            left_out.add(second)
-            note = f"the same drive as {first.id}{how or how_other}, as its actions and pictures show"
-            faults.add(second.place, "copy", note)
+        left_out.add(second)
+        faults.add(second.place, "copy", f"the same drive as {first.id}{way}, as its actions and pictures show")
     return tuple(episode for episode in episodes if episode not in left_out)
 
 
