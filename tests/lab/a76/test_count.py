@@ -25,8 +25,9 @@ from tests.helpers.policies import memory_samples
 
 pytestmark = [pytest.mark.emulated, needs.qemu]
 
-# Of the thin policy, in 1e6 instructions on an emulated Cortex-A76; a count may leave it by 2 %.
-BUDGETS_M = {"policy_static": 10.8, "policy_static.onnx": 11.8}
+# Of the thin policy, in 1e6 instructions on an emulated Cortex-A76, and by which share a count may leave it. ONNX
+# Runtime's depends on the machine that emulates: 11.81 on one, 12.06 on another, each time the same.
+BUDGETS_M = {"policy_static": (10.8, 0.02), "policy_static.onnx": (11.9, 0.03)}
 SVC = 0xD4000001
 START, ROUNDS, SECTION = 0x400000, 1000, 7
 
@@ -190,8 +191,9 @@ def test_a_run_is_counted(report, tiny_run):
     assert "policy_static" in reports.table(report)
     warm = [static[f"{n}_g"] for n in ("first", "second", "tenth")]
     assert warm == pytest.approx([static["instructions_g"]] * 3, rel=0.01)
-    counted = {stem: report["metrics"]["artifacts"][stem]["instructions_g"] * 1e3 for stem in BUDGETS_M}
-    assert counted == pytest.approx(BUDGETS_M, rel=0.02), "set BUDGETS_M if it is meant"
+    for stem, (budget_m, leeway) in BUDGETS_M.items():
+        counted_m = 1e3 * report["metrics"]["artifacts"][stem]["instructions_g"]
+        assert counted_m == pytest.approx(budget_m, rel=leeway), f"{stem}: set BUDGETS_M if it is meant"
 
 
 def test_what_onnx_runtime_runs_is_counted_like_the_rest(report):
