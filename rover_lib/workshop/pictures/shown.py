@@ -1,7 +1,7 @@
 """Find pictures that show nothing, or not what the car saw.
 
-A camera that stood still, black, white or grey pictures, a missing colour, a covered lens, colours or sides that are
-not those of the other drives.
+A camera that stood still, black, white or grey pictures, a missing colour, a covered lens, pictures in no order or of
+noise, colours or sides that are not those of the other drives.
 
     recordings = with_faults(recordings)     # its faults name them; `rover inspect` and notebook 01 do so
 
@@ -38,6 +38,10 @@ CLIPPED, DAZZLED = 250, 0.5  # a white pixel, and their share in half of the pic
 COMPARED = 30  # samples of a drive; fewer show what the car stood before, or who carried it
 COLOURLESS, COLOURED = 0.5, 4.0  # grey levels between a picture's colours, on average
 LEAST_COMPARED = 12  # pairs of pictures
+# From one picture to the next, the share of what changes between distant ones: at most 0.53 in 14 public tubs, of which
+# one has 4 pictures a second; 1 if they are in no order. Less than DIFFER grey levels between distant ones say nothing.
+UNRELATED, DIFFER = 0.8, 4.0
+LEAST_STEPS = 6
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,7 @@ class _Drive:
     """What a drive's pictures show. pictures: (n, 72, 96, 3) float32, those that were looked at.
 
     compared, equal: how many were compared with the next one while the car moved, and how many of these equal it.
-    longest: the most equal ones in a row.
+    longest: the most equal ones in a row. changes: (compared,), grey levels from each of them to the next, on average.
     """
 
     episode: Episode
@@ -53,6 +57,7 @@ class _Drive:
     compared: int
     equal: int
     longest: int
+    changes: np.ndarray
 
     @property
     def frozen(self) -> bool:
@@ -69,7 +74,16 @@ class _Drive:
 
     @property
     def shows_nothing(self) -> bool:
-        return self.flat.mean() >= BLANK or self.white > DAZZLED or self.missing != ""
+        return self.flat.mean() >= BLANK or self.white > DAZZLED or self.missing != "" or self.without_order
+
+    @property
+    def without_order(self) -> bool:
+        """Whether a picture is as far from the next one as from any other, although the car moves."""
+        if self.compared < LEAST_STEPS:
+            return False
+        distant = np.roll(self.pictures, len(self.pictures) // 2, axis=0)
+        apart = float(np.median(_difference(self.pictures, distant)))
+        return apart >= DIFFER and float(np.median(self.changes)) > UNRELATED * apart
 
     @cached_property
     def covered(self) -> float:
@@ -116,21 +130,21 @@ def _look(episode: Episode, camera: str, recordings: Recordings, drives: int) ->
     small = lru_cache(4)(lambda k: _scaled(samples[k], camera))
     moving = _moving(samples, recordings)
     pictures = []
+    changes = []
     equal = 0
-    compared = 0
     longest = 0
     try:
         for k in pick_evenly(range(len(samples)), count):
             pictures.append(small(k))
             if k + 1 == len(samples) or samples[k + 1].row != samples[k].row + 1 or not moving[k]:
                 continue
-            compared += 1
-            if _are_equal(small(k), small(k + 1)):
+            changes.append(float(_difference(small(k), small(k + 1))))
+            if changes[-1] < EQUAL:
                 equal += 1
                 longest = max(longest, _count_equal(samples, k, small, moving))
     except EpisodeError:
         return None
-    return _Drive(episode, np.stack(pictures), compared, equal, longest)
+    return _Drive(episode, np.stack(pictures), len(changes), equal, longest, np.array(changes))
 
 
 def _moving(samples: Sequence[Sample], recordings: Recordings) -> np.ndarray:
@@ -144,9 +158,9 @@ def _moving(samples: Sequence[Sample], recordings: Recordings) -> np.ndarray:
 def _count_equal(samples: Sequence[Sample], k: int, small: Any, moving: np.ndarray) -> int:
     """How many pictures around sample `k` equal their neighbours without a break, while an action changes."""
     first = last = k
-    while first and moving[first - 1] and _are_equal(small(first - 1), small(k)):
+    while first and moving[first - 1] and _difference(small(first - 1), small(k)) < EQUAL:
         first -= 1
-    while last + 1 < len(samples) and moving[last] and _are_equal(small(last + 1), small(k)):
+    while last + 1 < len(samples) and moving[last] and _difference(small(last + 1), small(k)) < EQUAL:
         last += 1
     changed = np.ptp([sample.chunk[0] for sample in samples[first : last + 1]], axis=0).max()
     return last + 1 - first if changed > 0 else 1
@@ -178,6 +192,11 @@ def _note_nothing(drive: _Drive, of_camera: str, faults: Faults) -> None:
         count = max(round(drive.equal / drive.compared * frames), drive.longest)
         note = f"the picture{of_camera} stood still for {drive.longest} frames while actions changed: leave it out"
         faults.add(drive.episode.place, "frozen_camera", note, count)
+    elif drive.without_order:
+        note = (
+            f"each picture{of_camera} differs from the next one as from any other: are they in another order, or noise?"
+        )
+        faults.add(drive.episode.place, "unordered_pictures", f"{note} Leave it out", frames)
 
 
 def _note_repeated(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> None:
@@ -245,5 +264,6 @@ def _scaled(sample: Sample, camera: str) -> np.ndarray:
     return cv2.resize(frame, SEEN, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
-def _are_equal(a: np.ndarray, b: np.ndarray) -> bool:
-    return float(np.abs(a - b).mean()) < EQUAL
+def _difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the grey levels between pictures, (..., 72, 96, 3), on average: (...)."""
+    return np.abs(a - b).mean((-3, -2, -1))

@@ -90,6 +90,8 @@ def grey(pictures):
         (part(slice(36), 4), "covered_lens"),
         (part(slice(36, 72), 4), "covered_lens"),
         (lambda pictures: pictures[np.arange(FRAMES) // 2 * 2], "repeated_pictures"),
+        (lambda pictures: np.random.default_rng(0).permutation(pictures), "unordered_pictures"),
+        (lambda pictures: np.random.default_rng(0).integers(0, 256, pictures.shape, np.uint8), "unordered_pictures"),
         (lambda pictures: pictures[..., ::-1], "swapped_colours"),
         (lambda pictures: pictures[:, ::-1, ::-1], "upside_down"),
         (lambda pictures: pictures[:, ::-1], "upside_down"),
