@@ -8,7 +8,7 @@ How it learns is rover_learn/act_phases.py's. Recordings that are mirrored besid
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -113,7 +113,10 @@ def train(
     def make(folder: Path) -> None:
         with machine.computing(), Resumable(unfinished, machine, progress) as saved:
             began_s = time.monotonic()
-            drives = _turned(recordings, progress)
+            sides = measure_sides(recordings, progress)
+            if lateness := sides.lateness():
+                say(lateness)
+            drives = _turned(recordings, sides.mirrored)
             content, actions = train_in_phases(drives, config, recipe, seed, saved, pretrained, say)
             say(f"in {time.monotonic() - began_s:.0f} s")
             leave_curves(folder / "curves", saved.losses, saved.judged, actions)
@@ -165,9 +168,8 @@ def _rate_hz(recordings: Recordings) -> float:
     return RATE_HZ
 
 
-def _turned(recordings: Recordings, progress: Progress) -> Recordings:
-    """Return the recordings with the pictures of those that are mirrored beside most others turned over."""
-    mirrored = measure_sides(recordings, progress).mirrored
+def _turned(recordings: Recordings, mirrored: Sequence[str]) -> Recordings:
+    """Return the recordings with the pictures of the mirrored episodes, by name, turned over."""
     episodes = list(recordings.episodes)
     for i, episode in enumerate(episodes):
         if episode.id in mirrored:

@@ -64,11 +64,17 @@ def _shared(pattern: str, what: str) -> Path:
     pytest.skip(f"no {what.split(maxsplit=1)[1]} here: put {what} at shared/{pattern} to run this test")
 
 
-def pass_a_wall(gain: float, amplitude: float = 0.3, frames: int = 120, seed: int = 0) -> Iterator[tuple[float, Any]]:
-    """Yield (steering, picture) of a drive: steering of 1 moves what is seen by `gain` pixels a frame, four later."""
+def pass_a_wall(
+    gain: float, amplitude: float = 0.3, frames: int = 120, seed: int = 0, steering: np.ndarray | None = None
+) -> Iterator[tuple[float, Any]]:
+    """Yield (steering, picture) of a drive: steering of 1 moves what is seen by `gain` pixels a frame, four later.
+
+    steering: (frames,); None: a sine of that amplitude.
+    """
     rng = np.random.default_rng(seed)
     wall = cv2.resize(rng.integers(0, 255, (20, 200), np.uint8), (2000, 100), interpolation=cv2.INTER_LINEAR)
-    steering = amplitude * np.sin(np.arange(frames) / 9 + rng.uniform(0, 6)) + rng.normal(0, amplitude / 20, frames)
+    if steering is None:
+        steering = amplitude * np.sin(np.arange(frames) / 9 + rng.uniform(0, 6)) + rng.normal(0, amplitude / 20, frames)
     shift = np.cumsum(np.concatenate([np.zeros(4), gain * steering]))[:frames]
     for steered, moved in zip(steering, shift, strict=True):
         view = np.float32([[1, 0, -900 + moved], [0, 1, 0]])

@@ -1,4 +1,4 @@
-"""Which way the cars of recordings steer, drive by drive, and which pictures are mirrored.
+"""Which way the cars of recordings steer, drive by drive, which pictures are mirrored, and which are late.
 
 Steering is correlated with the horizontal shift of the pictures' upper part between frames (optical flow), at the delay
 with the strongest correlation, which is judged as one of far fewer, independent frames (Bartlett's formula).
@@ -18,6 +18,7 @@ import numpy as np
 
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.faults import Faults
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, pick_evenly
 
 WIDTH, UPPER = 96, 0.6  # pixels of the examined pictures; the share of their rows above the floor
@@ -31,6 +32,12 @@ LEAST_PAIRS = 25
 LEAST_SPREAD = 0.05  # standard deviation of steering, of full; with less, other motion decides the correlation
 SURE = 2.2  # standard errors from no correlation
 MOST_PAIRS = 1000  # of a drive, of its longest pieces: two minutes are enough for any
+# Pictures show a turn USUAL_S after its steering in nine public tubs and the demo, within 0.1 s.
+DELAYS_S, USUAL_S = np.arange(-10, 21) / 10, 0.2
+ON_TIME_S = 0.45  # from the usual delay
+SURE_OF_DELAY = 5.0  # standard errors
+CLOSE_S = 0.25  # between the examined pictures; farther apart ones do not tell a delay
+WEAK = 0.6  # at a usual delay, of the strongest correlation: an oscillating steering agrees with later pictures too
 
 
 @dataclass(frozen=True)
@@ -38,7 +45,8 @@ class Turning:
     """correlation: of steering with the shift of the background to the right. sure: its standard errors from 0.
 
     episode: its name, or that of the session that it is a piece of. spread: the standard deviation of steering, a share
-    of full. pieces: the names of all its episodes.
+    of full. pieces: the names of all its episodes. by_delay: at each of DELAYS_S, the standard errors from 0, negative
+    where the correlation is; empty if that was not measured.
     """
 
     episode: str
@@ -46,6 +54,7 @@ class Turning:
     sure: float
     spread: float
     pieces: tuple[str, ...] = ()
+    by_delay: tuple[float, ...] = ()
 
     @property
     def side(self) -> str | None:
@@ -90,6 +99,30 @@ class Sides:
         return list(chain.from_iterable(others))
 
     @property
+    def late_s(self) -> float | None:
+        """By how much the pictures of all are later than the actions, negative if earlier; None if they are not."""
+        measured = [t.by_delay for t in self.turnings if t.by_delay and t.spread >= LEAST_SPREAD]
+        if not measured:
+            return None
+        together = np.abs(np.sum(measured, axis=0)) / math.sqrt(len(measured))
+        strongest = int(together.argmax())
+        usual = np.abs(DELAYS_S - USUAL_S) <= ON_TIME_S
+        if usual[strongest] or together[strongest] < SURE_OF_DELAY:
+            return None
+        if together[usual].max() > WEAK * together[strongest]:
+            return None
+        return float(DELAYS_S[strongest]) - USUAL_S
+
+    def lateness(self) -> str:
+        """Say by how much the pictures are later or earlier than the actions, and what to do; empty if they are not."""
+        late_s = self.late_s
+        if late_s is None:
+            return ""
+        word = "later" if late_s > 0 else "earlier"
+        seen = f"the pictures are some {abs(late_s):.1f} s {word} than the actions, as the car's turns show"
+        return f"{seen}: record both by one clock"
+
+    @property
     def denied(self) -> bool:
         """Whether the pictures show another side than the car's file says, as if all of them were mirrored."""
         return self.said is not None and self.side not in (None, self.said)
@@ -124,6 +157,15 @@ def measure_sides(recordings: Recordings, progress: Progress = silent, most: int
     return Sides(turnings, sides.pop() if len(sides) == 1 and layout.rate_hz is None else None)
 
 
+def with_late(recordings: Recordings, sides: Sides) -> Recordings:
+    """Return the recordings, with a fault if their pictures are later or earlier than the actions."""
+    if not (note := sides.lateness()):
+        return recordings
+    faults = Faults(recordings.root)
+    faults.add(recordings.root, "late_pictures", note, len(recordings.samples))
+    return replace(recordings, faults=(*recordings.faults, *faults.listed()))
+
+
 def measure_turning(drive: Sequence[Episode]) -> Turning:
     """Measure one drive of one camera, by its longest pieces."""
     pieces = list[Sequence[Sample]]()
@@ -143,16 +185,26 @@ def measure_turning(drive: Sequence[Episode]) -> Turning:
         shifts = [_shifts(samples) for samples in pieces]
     except EpisodeError:
         return best
-    shift = np.concatenate([of for _, of in shifts])
-    for delay_s in np.linspace(0, LONGEST_DELAY_S, 7) if len(shift) >= LEAST_PAIRS else ():
+    shift = _smooth(np.concatenate([of for _, of in shifts]))
+    if len(shift) < LEAST_PAIRS:
+        return best
+
+    def correlate(delay_s: float) -> tuple[float, float]:
+        """Return the correlation with what was steered so long before, and its standard errors from 0."""
         steered = []
         for samples, (times_s, _) in zip(pieces, shifts, strict=True):
             every_s = np.array([s.time_s for s in samples])
             steered.append(np.interp(times_s - delay_s, every_s, [s.chunk[0, 0] for s in samples]))
-        correlation = _correlation(_smooth(np.concatenate(steered)), _smooth(shift))
-        if correlation and correlation[1] > best.sure:
-            best = replace(best, correlation=correlation[0], sure=correlation[1])
-    return best
+        return _correlation(_smooth(np.concatenate(steered)), shift) or (0.0, 0.0)
+
+    for delay_s in np.linspace(0, LONGEST_DELAY_S, 7):
+        correlation, sure = correlate(delay_s)
+        if sure > best.sure:
+            best = replace(best, correlation=correlation, sure=sure)
+    if np.median(np.diff(np.concatenate([times_s for times_s, _ in shifts]))) > CLOSE_S:
+        return best
+    by_delay = [math.copysign(sure, correlation) for correlation, sure in map(correlate, DELAYS_S)]
+    return replace(best, by_delay=tuple(by_delay))
 
 
 def _shifts(samples: Sequence[Sample]) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.kinds import check_kind, kinds_of
 from rover_lib.onboard.stage import read_stage, sha256_of
 from rover_lib.workshop.pictures.shown import with_faults
-from rover_lib.workshop.pictures.turning import measure_sides
+from rover_lib.workshop.pictures.turning import measure_sides, with_late
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.source import Source
@@ -48,7 +48,7 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
     if kind in ("recordings", "dataset", "tub") or (kind is None and path.is_dir()):
         recordings = with_faults(load_recordings(source, progress=progress), progress)
         sides = measure_sides(recordings, progress, DRIVES)
-        content = recordings.summary()
+        content = with_late(recordings, sides).summary()
         if sides.turnings:
             content |= {"steering": sides.words(), "by_episode": [turning.words() for turning in sides.turnings]}
         return {"recordings": content}

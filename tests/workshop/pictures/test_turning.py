@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rover_lib.workshop.pictures.turning import LEAST_SPREAD, measure_sides
+from rover_lib.workshop.pictures.turning import LEAST_SPREAD, measure_sides, with_late
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import Episode, Recordings
 from rover_lib.workshop.recordings.source import Source
 from tests.helpers.recorded import PictureSample, pass_a_wall, real_recordings
 
 
-def drive(name, gain, amplitude=0.3, frames=120, seed=0):
+def drive(name, gain, amplitude=0.3, frames=120, seed=0, wandering=None):
     samples = []
-    for i, (steering, frame) in enumerate(pass_a_wall(gain, amplitude, frames, seed)):
+    for i, (steering, frame) in enumerate(pass_a_wall(gain, amplitude, frames, seed, wandering)):
         chunk = np.float32([[steering, 0.05]])
         samples.append(PictureSample(name, Path("x"), i / 30, chunk[0], chunk, np.zeros(1, bool), i, picture=frame))
     return Episode(name, Path(name), "", frames / 30, frames, frames, tuple(samples), ())
@@ -43,6 +43,26 @@ def test_what_disagrees_with_the_others_is_mirrored():
     assert measure_sides(recordings(turned)).side == "right"
     assert measure_sides(recordings()).words() == ""
     assert "too little" in measure_sides(recordings(drive("a", 0))).words()
+
+
+@pytest.mark.parametrize("late_s", [1.0, -0.8, 0.1])
+def test_pictures_that_are_late_are_told(late_s):
+    episodes = []
+    for i in range(2):
+        wandering = np.convolve(np.random.default_rng(i).normal(0, 0.05, 615), np.ones(16), "valid")
+        drove = drive(f"e{i}", -8, frames=600, seed=i, wandering=wandering)
+        samples = drove.samples
+        k = round(30 * late_s)
+        late = [replace(s, picture=samples[min(max(s.row - k, 0), 599)].picture) for s in samples]
+        episodes.append(replace(drove, samples=tuple(late)))
+    together = recordings(*episodes)
+    sides = measure_sides(together)
+    cautions = with_late(together, sides).cautions()
+    if late_s == 0.1:
+        assert sides.late_s is None and sides.side == "right" and not cautions
+    else:
+        assert sides.late_s == pytest.approx(late_s, abs=0.2)
+        assert f"s {'later' if late_s > 0 else 'earlier'} than the actions" in cautions[0]
 
 
 def test_pictures_that_are_all_mirrored_are_held_against_the_cars_file():
