@@ -185,9 +185,10 @@ def measure_turning(drive: Sequence[Episode]) -> Turning:
         shifts = [_shifts(samples) for samples in pieces]
     except EpisodeError:
         return best
-    shift = _smooth(np.concatenate([of for _, of in shifts]))
+    shift = np.concatenate([of for _, of in shifts])
     if len(shift) < LEAST_PAIRS:
         return best
+    shift = _smooth(shift)
 
     def correlate(delay_s: float) -> tuple[float, float]:
         """Return the correlation with what was steered so long before, and its standard errors from 0."""

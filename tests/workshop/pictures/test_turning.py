@@ -43,6 +43,8 @@ def test_what_disagrees_with_the_others_is_mirrored():
     assert measure_sides(recordings(turned)).side == "right"
     assert measure_sides(recordings()).words() == ""
     assert "too little" in measure_sides(recordings(drive("a", 0))).words()
+    plain = tuple(replace(s, picture=np.zeros_like(s.picture)) for s in odd.samples)
+    assert "too little" in measure_sides(recordings(replace(odd, samples=plain))).words()
 
 
 @pytest.mark.parametrize("late_s", [1.0, -0.8, 0.1])
