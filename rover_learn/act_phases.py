@@ -5,7 +5,8 @@
         checkpoint, actions = train_in_phases(recordings, SIZES["small"], recipe, 0, saved, None, print)
 
 The backbone alone, with live batch norm, learns to predict the plan; then the transformer learns on the frozen
-backbone's features, which are computed once; then both learn together at a tenth of the rate.
+backbone's features, which are computed once, maybe also from softened plans (rover_learn/soften.py), and the better of
+the two stays; then both learn together at a tenth of the rate.
 
 A phase stops by what it sees: backbone and whole policy learn in rounds, as long as their error on recordings that they
 do not learn from falls, within a budget of minutes. That error is shown by action, beside the best guess without eyes.
@@ -29,6 +30,7 @@ from rover_learn.backbone import FEATURES, PlanFromFeatures, Pretrained, live_ba
 from rover_learn.curves import ROUND
 from rover_learn.judges import Judges
 from rover_learn.phases import LARGE, Recipe
+from rover_learn.soften import soften
 from rover_learn.training import ACTION, IMAGE, IS_PAD, STATE, Batch, Best, Frames, Phase, Resumable
 from rover_lib.onboard.params import params
 from rover_lib.workshop.act import ActConfig
@@ -61,7 +63,8 @@ class TrainingRecipe(Recipe):
 
     backbone_steps, together_steps: of a round; backbone_rounds, together_rounds: at most. minutes: a budget, of the
     processor or, on a GPU, as they pass: no further round begins that would not fit. mirrored: share of the pictures
-    that are turned over. light to noise: see Augmentation. at: (height, width) of the pictures in all phases but the
+    that are turned over. light to noise: see Augmentation. softened: share of the line's plan in what the transformer
+    learns from a second time, at softened_rate; 0: only once. at: (height, width) of the pictures in all phases but the
     last; None: the policy's own, and no last phase.
     """
 
@@ -85,6 +88,8 @@ class TrainingRecipe(Recipe):
     shift: float = 0.0
     blur: float = 0.0
     noise: float = 0.0
+    softened: float = 0.0
+    softened_rate: float = 2.0e-4
     at: tuple[int, int] | None = None
     carry_steps: int = 0
 
@@ -118,7 +123,7 @@ class TrainingRecipe(Recipe):
             "feature_samples": min(self.feature_samples, steps * batches["transformer_batch"]),
             "judged": min(self.judged, max(8, steps)),
         }
-        once = replace(self.of_steps(steps), backbone_rounds=1, together_rounds=1, transformer_warmup=0)
+        once = replace(self.of_steps(steps), backbone_rounds=1, together_rounds=1, transformer_warmup=0, softened=0.0)
         return replace(once, **(batches | counts))
 
 
@@ -358,24 +363,45 @@ def _train_transformer(training: PolicyTraining) -> np.ndarray:
     judging = np.arange(len(training.judging))
     judging_maps = _features(training, "judges", training.judging, judging, backbone)
 
-    def batch(_: int) -> Batch:
-        picked = rng.choice(len(sources), min(recipe.transformer_batch, len(sources)), replace=False)
-        rows = sources[picked]
-        states = loop.swap_states(data, rows, rng)
-        chunks = data.chunks[rows].copy()
-        states[flipped[picked], 0] *= -1
-        chunks[flipped[picked], :, 0] *= -1
-        arrays = {IMAGE: maps[picked], STATE: states, ACTION: chunks, IS_PAD: data.is_pad[rows]}
-        return loop.on_device(arrays, training.weights.device)
-
+    chunks = data.chunks[sources]
+    chunks[flipped, :, 0] *= -1
     policy.model.backbone = loop.FeatureInput()
-    policy.train()
-    phase = Phase("transformer", recipe.transformer_steps, recipe.transformer_rate, recipe.transformer_warmup)
-    with loop.threads(1 if policy.config.dim_model < SMALL_DIM else torch.get_num_threads()):
+    began_with = copy.deepcopy(policy.state_dict())
+
+    def learn(name: str, plans: np.ndarray, rate: float) -> np.ndarray:
+        """Train on these plans, (n, C, A), and return the errors by action."""
+
+        def batch(_: int) -> Batch:
+            picked = rng.choice(len(sources), min(recipe.transformer_batch, len(sources)), replace=False)
+            rows = sources[picked]
+            states = loop.swap_states(data, rows, rng)
+            states[flipped[picked], 0] *= -1
+            arrays = {IMAGE: maps[picked], STATE: states, ACTION: plans[picked], IS_PAD: data.is_pad[rows]}
+            return loop.on_device(arrays, training.weights.device)
+
+        policy.train()
+        phase = Phase(name, recipe.transformer_steps, rate, recipe.transformer_warmup)
         best = Best(lambda: training.judge(judging_maps), training.judges.overall_pct)
         training.saved.train(phase, policy, rng, batch, training.loss, best)
         errors = training.judge(judging_maps)
-    training.say(f"transformer: {training.judges.words(errors)}")
+        training.say(f"{name}: {training.judges.words(errors)}")
+        return errors
+
+    with loop.threads(1 if policy.config.dim_model < SMALL_DIM else torch.get_num_threads()):
+        errors = learn("transformer", chunks, recipe.transformer_rate)
+        if recipe.softened:
+            of_recorded = copy.deepcopy(policy.state_dict())
+            policy.load_state_dict(began_with)
+
+            def judge(plans: np.ndarray) -> float:
+                return training.judges.overall_pct(training.judges.errors_pct(plans))
+
+            soft = soften(maps, chunks, recipe.softened, judging_maps, judge)
+            of_softened = learn("transformer, softened", soft, recipe.softened_rate)
+            if training.judges.overall_pct(of_softened) < training.judges.overall_pct(errors):
+                errors = of_softened
+            else:
+                policy.load_state_dict(of_recorded)
     policy.model.backbone = backbone
     return errors
 

@@ -34,7 +34,7 @@ from rover_lib.workshop.recordings.samples import Sample
 from rover_lib.workshop.run import run_folder
 from rover_lib.workshop.run.session import SMALL_GMAC
 
-MOST = {"to_parent": 1.0, "held_out_share": 0.999, "mirrored": 0.5, "blur": 1.0, "shift": 0.2}
+MOST = {"to_parent": 1.0, "held_out_share": 0.999, "mirrored": 0.5, "blur": 1.0, "shift": 0.2, "softened": 1.0}
 MAY_BE_ZERO = ("seed", "transformer_warmup")
 LEAST_RATE = 1e-9
 LARGE = 10**9

@@ -14,7 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from rover_exchange.export_dataset import lerobot_train
-from rover_learn import act_phases, augment, backbone, judges, training
+from rover_learn import act_phases, augment, backbone, judges, soften, training
 from rover_learn.act_phases import Overrides, TrainingRecipe, train_in_phases
 from rover_learn.backbone import Pretrained
 from rover_learn.curves import leave_curves
@@ -52,7 +52,7 @@ SIZES = {
 FULL_VERSION = 4
 # Whose sources decide what a training results in.
 LEARNERS = (
-    *(sys.modules[__name__], act_phases, backbone, augment, judges, training),
+    *(sys.modules[__name__], act_phases, backbone, augment, judges, soften, training),
     *(act, act_config, preprocess, recorded_episodes, controls),
 )
 
