@@ -26,6 +26,7 @@ from rover_lib.onboard.stage import read_stage, write_stage
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8.familiar import EVERY_S
+from rover_lib.workshop.recordings.blocks import usual_rate_hz
 from rover_lib.workshop.recordings.episodes import Split, load_recordings, split
 from rover_lib.workshop.recordings.samples import Sample, block_of, frame_rate_hz, pick_evenly
 from rover_lib.workshop.recordings.source import Source
@@ -98,9 +99,8 @@ def main(out: str, described: str) -> None:
         recordings = load_recordings(Source.of(car["tub"], throttle=car.get("throttle", "")))
         parts = split(recordings, p["held_out_share"], p["seed"])
         stretches[name] = windows((*parts.choosing, *parts.held_out))
-        rate_hz = frame_rate_hz([s for s in parts.calibration if s.episode == parts.calibration[0].episode])
         rows[name] = {"camera": car["camera"], "pictures": len(recordings.samples)}
-        rows[name] |= {"rate_hz": rate_hz, "split": parts.note}
+        rows[name] |= {"rate_hz": usual_rate_hz(recordings.episodes), "split": parts.note}
         if "run" in car:
             rows[name] |= steering(car, parts) | of_int8(Path(car["run"]))
             rows[name]["cnn_r2"] = json.loads(Path(car["cnn"]).read_text())[Path(car["tub"]).name]["r2"]
