@@ -5,8 +5,8 @@
         checkpoint, actions = train_in_phases(recordings, SIZES["small"], recipe, 0, saved, None, print)
 
 The backbone alone, with live batch norm, learns to predict the plan; then the transformer learns on the frozen
-backbone's features, which are computed once, maybe also from softened plans (rover_learn/soften.py), and the better of
-the two stays; then both learn together at a tenth of the rate.
+backbone's features, which are computed once, with softened plans if the recipe says so; then both learn together at a
+tenth of the rate.
 
 A phase stops by what it sees: backbone and whole policy learn in rounds, as long as their error on recordings that they
 do not learn from falls, within a budget of minutes. That error is shown by action, beside the best guess without eyes.
@@ -31,7 +31,7 @@ from rover_learn.curves import ROUND
 from rover_learn.judges import Judges
 from rover_learn.phases import LARGE, Recipe
 from rover_learn.soften import soften
-from rover_learn.training import ACTION, IMAGE, IS_PAD, STATE, Batch, Best, Frames, Phase, Resumable
+from rover_learn.training import ACTION, IMAGE, IS_PAD, SOFTENED, STATE, Batch, Best, Frames, Phase, Resumable
 from rover_lib.onboard.params import params
 from rover_lib.workshop.act import ActConfig
 from rover_lib.workshop.act_config import lerobot_act
@@ -63,9 +63,9 @@ class TrainingRecipe(Recipe):
 
     backbone_steps, together_steps: of a round; backbone_rounds, together_rounds: at most. minutes: a budget, of the
     processor or, on a GPU, as they pass: no further round begins that would not fit. mirrored: share of the pictures
-    that are turned over. light to noise: see Augmentation. softened: share of the line's plan in what the transformer
-    learns from a second time, at softened_rate; 0: only once. at: (height, width) of the pictures in all phases but the
-    last; None: the policy's own, and no last phase.
+    that are turned over. light to noise: see Augmentation. softened: share of the line's plan, as `soften` takes it,
+    in what the transformer's squared errors count from; then it learns at softened_rate. at: (height, width) of the
+    pictures in all phases but the last; None: the policy's own, and no last phase.
     """
 
     PHASES = ("backbone", "transformer", "together", "carry")
@@ -170,6 +170,10 @@ class PolicyTraining:
         plans = np.concatenate([loop.plans_on(self.policy, self.judging, rows, maps) for rows in blocks])
         self.policy.train()
         return plans
+
+    def overall_error(self, plans: np.ndarray) -> float:
+        """Return one error of plans on what judges the policy, (n, C, A), in % of the range."""
+        return self.judges.overall_pct(self.judges.errors_pct(plans))
 
     def judge(self, maps: loop.RowFile | None = None) -> np.ndarray:
         """Return the policy's errors by action, (A,), in % of the range."""
@@ -365,43 +369,29 @@ def _train_transformer(training: PolicyTraining) -> np.ndarray:
 
     chunks = data.chunks[sources]
     chunks[flipped, :, 0] *= -1
+    extra = {}
+    rate = recipe.transformer_rate
+    if recipe.softened:
+        rate = recipe.softened_rate
+        extra[SOFTENED] = soften(maps, chunks, recipe.softened, judging_maps, training.overall_error)
+
+    def batch(_: int) -> Batch:
+        picked = rng.choice(len(sources), min(recipe.transformer_batch, len(sources)), replace=False)
+        rows = sources[picked]
+        states = loop.swap_states(data, rows, rng)
+        states[flipped[picked], 0] *= -1
+        arrays = {IMAGE: maps[picked], STATE: states, ACTION: chunks[picked], IS_PAD: data.is_pad[rows]}
+        arrays |= {name: plans[picked] for name, plans in extra.items()}
+        return loop.on_device(arrays, training.weights.device)
+
     policy.model.backbone = loop.FeatureInput()
-    began_with = copy.deepcopy(policy.state_dict())
-
-    def learn(name: str, plans: np.ndarray, rate: float) -> np.ndarray:
-        """Train on these plans, (n, C, A), and return the errors by action."""
-
-        def batch(_: int) -> Batch:
-            picked = rng.choice(len(sources), min(recipe.transformer_batch, len(sources)), replace=False)
-            rows = sources[picked]
-            states = loop.swap_states(data, rows, rng)
-            states[flipped[picked], 0] *= -1
-            arrays = {IMAGE: maps[picked], STATE: states, ACTION: plans[picked], IS_PAD: data.is_pad[rows]}
-            return loop.on_device(arrays, training.weights.device)
-
-        policy.train()
-        phase = Phase(name, recipe.transformer_steps, rate, recipe.transformer_warmup)
+    policy.train()
+    phase = Phase("transformer", recipe.transformer_steps, rate, recipe.transformer_warmup)
+    with loop.threads(1 if policy.config.dim_model < SMALL_DIM else torch.get_num_threads()):
         best = Best(lambda: training.judge(judging_maps), training.judges.overall_pct)
         training.saved.train(phase, policy, rng, batch, training.loss, best)
         errors = training.judge(judging_maps)
-        training.say(f"{name}: {training.judges.words(errors)}")
-        return errors
-
-    with loop.threads(1 if policy.config.dim_model < SMALL_DIM else torch.get_num_threads()):
-        errors = learn("transformer", chunks, recipe.transformer_rate)
-        if recipe.softened:
-            of_recorded = copy.deepcopy(policy.state_dict())
-            policy.load_state_dict(began_with)
-
-            def judge(plans: np.ndarray) -> float:
-                return training.judges.overall_pct(training.judges.errors_pct(plans))
-
-            soft = soften(maps, chunks, recipe.softened, judging_maps, judge)
-            of_softened = learn("transformer, softened", soft, recipe.softened_rate)
-            if training.judges.overall_pct(of_softened) < training.judges.overall_pct(errors):
-                errors = of_softened
-            else:
-                policy.load_state_dict(of_recorded)
+    training.say(f"transformer: {training.judges.words(errors)}")
     policy.model.backbone = backbone
     return errors
 

@@ -1,6 +1,6 @@
 """Soften recorded plans: a share of each is what a line through the backbone's features says of it.
 
-    soft = soften(maps, chunks, share, choose)
+    softened = soften(maps, chunks, share, judging, judge)
 
 What a driver does half a second later is noise in part, which a transformer learns by heart within some hundred steps.
 A ridge regression on features that are averaged over the picture cannot.

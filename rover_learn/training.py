@@ -43,6 +43,7 @@ T = TypeVar("T")
 M = TypeVar("M", bound=nn.Module)
 Batch = dict[str, Tensor]
 IMAGE, STATE, ACTION, IS_PAD = "observation.images.cam_front", "observation.state", "action", "action_is_pad"
+SOFTENED = "softened"  # of a batch, beside LeRobot's keys: the plans that squared errors count from, (B, C, A)
 SWAPPED_STATES = 0.5  # the share of samples that get another's state, so that the state does not give the action away
 STANDING_THROTTLE = 0.01  # below it the car stands, which no frame shows, so such a state is never swapped
 SAVE_EVERY_S = 60.0
@@ -473,11 +474,15 @@ def error_of(predicted: Tensor, batch: Batch, loss_weights: Tensor) -> Tensor:
     """Return the mean error over the recorded actions, without padding, times loss_weights, (2,).
 
     Absolute and squared errors are added. Absolute ones alone, LeRobot's, let plans rest on the action that is usual:
-    a driver steers straight half of the time. Squared ones alone plan the mean of left and right.
+    a driver steers straight half of the time. Squared ones alone plan the mean of left and right. They count from
+    softened plans if the batch has some, as a driver's noise weighs most in them.
     """
     recorded = ~batch[IS_PAD][..., None]
     error = (predicted - batch[ACTION]).abs() * loss_weights * recorded
-    return (error + error.square()).sum() / (recorded.sum() * loss_weights.numel())
+    far = error
+    if SOFTENED in batch:
+        far = (predicted - batch[SOFTENED]) * loss_weights * recorded
+    return (error + far.square()).sum() / (recorded.sum() * loss_weights.numel())
 
 
 def policy_loss(policy: "ACTPolicy", batch: Batch, loss_weights: Tensor) -> Tensor:

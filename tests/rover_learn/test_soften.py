@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
 
 from rover_learn.backbone import FEATURES
 from rover_learn.soften import RIDGES, soften
-from rover_learn.training import RowFile
+from rover_learn.training import ACTION, IS_PAD, SOFTENED, RowFile, error_of
 
 LEARNED, JUDGED, NOISE = 1200, 300, 0.5
 
@@ -37,3 +38,12 @@ def test_noise_is_taken_from_plans_and_what_the_features_say_stays(tmp_path):
     assert off < 0.65 * NOISE and min(errors) < errors[0]
     assert np.std(softened - said[0]) == pytest.approx(np.hypot(NOISE, off) / 2, rel=0.35)
     assert np.allclose(soften(files[0], recorded, 0.0, files[1], judge), recorded)
+
+
+def test_squared_errors_count_from_softened_plans_and_absolute_ones_from_recorded_ones():
+    recorded, softened, planned = (torch.full((1, 2, 1), value) for value in (1.0, 2.0, 4.0))
+    is_pad = torch.tensor([[False, True]])
+    batch = {ACTION: recorded, IS_PAD: is_pad}
+    weights = torch.tensor([0.5])
+    assert float(error_of(planned, batch, weights)) == 1.5 + 1.5**2
+    assert float(error_of(planned, batch | {SOFTENED: softened}, weights)) == 1.5 + 1.0**2

@@ -80,7 +80,7 @@ def test_a_training_ended_in_each_phase_gives_the_same_weights(drives, trained, 
     monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
     torch.rand(3)  # the state of the global generator must not matter, nor change
     before, out = torch.get_rng_state(), tmp_path / "killed.pth"
-    for kill_at in (2, 4, 4, 5, 4):  # in each round of the backbone's, of the transformer's, and in all together's
+    for kill_at in (2, 4, 4, 3):  # in each round of the backbone's, in the transformer's steps, and in all together's
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             interrupt(patch, training_module, "descend", kill_at)
             train(drives, out, machine=READING_AHEAD)
@@ -104,17 +104,6 @@ def test_a_training_ended_in_each_phase_gives_the_same_weights(drives, trained, 
     other = torch.load(train(drives, tmp_path / "other.pth", seed=1, machine=CPU), weights_only=False)
     name = "model.action_head.weight"
     assert not torch.equal(other["model_state_dict"][name], whole["model_state_dict"][name])
-
-
-def test_what_softened_plans_make_worse_does_not_stay(drives, tmp_path, monkeypatch, set_params):
-    set_params(CARRIED)
-    monkeypatch.setenv("ROVER_CACHE", str(tmp_path))
-    monkeypatch.setattr(act_phases, "soften", lambda _, plans, *__: plans + 100)
-    said = []
-    train(drives, tmp_path / "policy.pth", machine=CPU, say=said.append)
-    off = {line.partition(":")[0]: float(line.split("steering ")[1].split()[0]) for line in said if "% off" in line}
-    plain, wild = off["transformer"], off["transformer, softened"]
-    assert wild > 1.2 * plain and off["on recordings that it did not learn from"] < (plain + wild) / 2
 
 
 @pytest.mark.parametrize(("differs", "anew"), [("", False), (", small_cuda: {backbone_steps: 3}", True)])
