@@ -190,12 +190,13 @@ def measure_turning(drive: Sequence[Episode]) -> Turning:
         return best
     shift = _smooth(shift)
 
+    recorded = [(np.array([s.time_s for s in of]), np.array([s.chunk[0, 0] for s in of], float)) for of in pieces]
+
     def correlate(delay_s: float) -> tuple[float, float]:
         """Return the correlation with what was steered so long before, and its standard errors from 0."""
         steered = []
-        for samples, (times_s, _) in zip(pieces, shifts, strict=True):
-            every_s = np.array([s.time_s for s in samples])
-            steered.append(np.interp(times_s - delay_s, every_s, [s.chunk[0, 0] for s in samples]))
+        for (every_s, actions), (times_s, _) in zip(recorded, shifts, strict=True):
+            steered.append(np.interp(times_s - delay_s, every_s, actions))
         return _correlation(_smooth(np.concatenate(steered)), shift) or (0.0, 0.0)
 
     for delay_s in np.linspace(0, LONGEST_DELAY_S, 7):
@@ -251,7 +252,12 @@ def _correlation(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
     if norm < 1e-9:
         return None
     r = float(x @ y) / norm
-    lags = range(1, n // 2)
-    together = sum((1 - k / n) * (x[k:] @ x[:-k]) * (y[k:] @ y[:-k]) for k in lags) / norm**2
+    lags = np.arange(1, n // 2)
+    together = float((1 - lags / n) @ (_autocovariance(x)[lags] * _autocovariance(y)[lags])) / norm**2
     independent = min(max(n / max(1 + 2 * together, 1), 4), n)
     return r, math.atanh(min(abs(r), 0.999)) * math.sqrt(independent - 3)
+
+
+def _autocovariance(x: np.ndarray) -> np.ndarray:
+    """Return the sum of x[k:] * x[:-k] for each lag k, (n,), by Fourier's transform: one by one takes a second."""
+    return np.fft.irfft(np.abs(np.fft.rfft(x, 2 * len(x))) ** 2, 2 * len(x))[: len(x)]
