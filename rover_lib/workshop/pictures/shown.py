@@ -48,16 +48,24 @@ LEAST_STEPS = 6
 class _Drive:
     """What a drive's pictures show. pictures: (n, 72, 96, 3) float32, those that were looked at.
 
-    compared, equal: how many were compared with the next one while the car moved, and how many of these equal it.
-    longest: the most equal ones in a row. changes: (compared,), grey levels from each of them to the next, on average.
+    changes: (m,), grey levels on average from a picture to the next one, of those at which the car moved. longest: the
+    most equal ones in a row.
     """
 
     episode: Episode
     pictures: np.ndarray
-    compared: int
-    equal: int
-    longest: int
     changes: np.ndarray
+    longest: int
+
+    @property
+    def compared(self) -> int:
+        """How many pictures were compared with the next one."""
+        return len(self.changes)
+
+    @property
+    def equal(self) -> int:
+        """How many of them equal it."""
+        return int((self.changes < EQUAL).sum())
 
     @property
     def frozen(self) -> bool:
@@ -131,7 +139,6 @@ def _look(episode: Episode, camera: str, recordings: Recordings, drives: int) ->
     moving = _moving(samples, recordings)
     pictures = []
     changes = []
-    equal = 0
     longest = 0
     try:
         for k in pick_evenly(range(len(samples)), count):
@@ -140,11 +147,10 @@ def _look(episode: Episode, camera: str, recordings: Recordings, drives: int) ->
                 continue
             changes.append(float(_difference(small(k), small(k + 1))))
             if changes[-1] < EQUAL:
-                equal += 1
                 longest = max(longest, _count_equal(samples, k, small, moving))
     except EpisodeError:
         return None
-    return _Drive(episode, np.stack(pictures), len(changes), equal, longest, np.array(changes))
+    return _Drive(episode, np.stack(pictures), np.array(changes), longest)
 
 
 def _moving(samples: Sequence[Sample], recordings: Recordings) -> np.ndarray:

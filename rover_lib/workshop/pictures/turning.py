@@ -32,7 +32,7 @@ LEAST_PAIRS = 25
 LEAST_SPREAD = 0.05  # standard deviation of steering, of full; with less, other motion decides the correlation
 SURE = 2.2  # standard errors from no correlation
 MOST_PAIRS = 1000  # of a drive, of its longest pieces: two minutes are enough for any
-# Pictures show a turn USUAL_S after its steering in nine public tubs and the demo, within 0.1 s.
+# Pictures show a turn USUAL_S after its steering in twelve public tubs and the demo, within 0.1 s.
 DELAYS_S, USUAL_S = np.arange(-10, 21) / 10, 0.2
 ON_TIME_S = 0.45  # from the usual delay
 SURE_OF_DELAY = 5.0  # standard errors
@@ -189,11 +189,10 @@ def measure_turning(drive: Sequence[Episode]) -> Turning:
     if len(shift) < LEAST_PAIRS:
         return best
     shift = _smooth(shift)
-
     recorded = [(np.array([s.time_s for s in of]), np.array([s.chunk[0, 0] for s in of], float)) for of in pieces]
 
     def correlate(delay_s: float) -> tuple[float, float]:
-        """Return the correlation with what was steered so long before, and its standard errors from 0."""
+        """Return how the shift correlates with the steering `delay_s` earlier, and its standard errors from 0."""
         steered = []
         for (every_s, actions), (times_s, _) in zip(recorded, shifts, strict=True):
             steered.append(np.interp(times_s - delay_s, every_s, actions))

@@ -9,8 +9,8 @@ from rover_lib.onboard.errors import EpisodeError
 
 # Faults of pictures that are whole: a policy that learned from them drives badly, and nothing else tells.
 SHOW_NOTHING = (
-    "frozen_camera|repeated_pictures|unordered_pictures|late_pictures|blank_pictures|without_colours|swapped_colours|upside_down"
-    "|covered_lens"
+    "frozen_camera|repeated_pictures|unordered_pictures|late_pictures|blank_pictures"
+    "|without_colours|swapped_colours|upside_down|covered_lens"
 )
 HANDLED = {  # what is done about a fault, by its kind
     "repaired": "serial_burst|unsorted_.*_times|stood_unrecorded|scrambled_index|other_units|other_times",
