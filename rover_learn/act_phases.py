@@ -161,8 +161,7 @@ class PolicyTraining:
 
     def judging_blocks(self) -> list[np.ndarray]:
         """Return the rows of what judges, in blocks that fit into memory."""
-        count = len(self.judging)
-        return np.split(np.arange(count), range(JUDGED_AT_ONCE, count, JUDGED_AT_ONCE))
+        return loop.blocks_of(len(self.judging), JUDGED_AT_ONCE)
 
     def plans(self, maps: loop.RowFile | None = None) -> np.ndarray:
         """Return the policy's plans on what judges it, (n, C, A). maps: as of `plans_on`."""

@@ -146,7 +146,7 @@ class Lessons:
     @property
     def blocks(self) -> list[np.ndarray]:
         """The numbers of all samples, in blocks of BLOCK, on which a policy plans at once."""
-        return np.split(np.arange(len(self)), range(BLOCK, len(self), BLOCK))
+        return training.blocks_of(len(self), BLOCK)
 
     def pictures(self, rows: np.ndarray, views: np.ndarray) -> np.ndarray:
         """Return the pictures of these samples, (B, height, width, 3) uint8, mirrored where views, (B,), says so."""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from rover_learn.backbone import FEATURES
-from rover_learn.training import RowFile
+from rover_learn.training import RowFile, blocks_of
 
 RIDGES = (1.0, 10.0, 100.0, 1000.0, 10_000.0)
 AT_ONCE = 256  # maps
@@ -52,5 +52,5 @@ def soften(
 
 def _averaged(maps: RowFile) -> np.ndarray:
     """Return features averaged over the picture, (n, 512) float64."""
-    blocks = np.split(np.arange(len(maps)), range(AT_ONCE, len(maps), AT_ONCE))
+    blocks = blocks_of(len(maps), AT_ONCE)
     return np.concatenate([maps[rows].mean(axis=(2, 3), dtype=np.float64) for rows in blocks])

@@ -408,6 +408,11 @@ def ahead(make: Callable[[int], T], items: Iterable[int], count: int) -> Generat
         pool.shutdown(cancel_futures=True)
 
 
+def blocks_of(count: int, at_once: int) -> list[np.ndarray]:
+    """Return the numbers below `count` in blocks of at most `at_once`, (m,) each."""
+    return np.split(np.arange(count), range(at_once, count, at_once))
+
+
 @contextmanager
 def threads(count: int) -> Iterator[None]:
     """Let torch compute with this number of threads inside the block."""
